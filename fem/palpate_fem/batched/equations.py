@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.batched import kernels, mortar_kernels
+from palpate_fem.batched.launches import Launches
 from palpate_fem.batched.state import (
     BatchedState,
     Listed,
@@ -62,6 +63,7 @@ class BatchedEquations:
         """
         self.system, self.slots, self.device = system, slots, device
         self._lists: dict[bytes, Listed] = {}
+        self._launch = Launches(device)
         mesh, pattern, skin = system.mesh, system.pattern, system.skin
         self._law, self._core_law = system.contact.law(friction), system.contact.law(0.0)
         self._nodes, self._elements_each = len(mesh.nodes), len(mesh.elements)
@@ -611,6 +613,3 @@ class BatchedEquations:
             [listed.slots, each, source.flatten() if integers else flat(source)],
             [copy.flatten() if integers else flat(copy)],
         )
-
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

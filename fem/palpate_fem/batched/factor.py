@@ -21,10 +21,8 @@ from palpate_fem.batched import factor_kernels as kernels
 from palpate_fem.batched import solve_kernels
 from palpate_fem.batched.dense_tiles import LANES, THREADS, TILE
 from palpate_fem.batched.factor_kernels import GATHERED
+from palpate_fem.batched.launches import Launches
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
-
-KEPT_LAUNCHES = 1000
-"""Launches that are kept: several times those of a factorisation and of the solves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +147,7 @@ class BatchedFactor:
         self.values = wp.zeros((slots, len(indices)), dtype=wp.float64, device=device)
         # No number is what it was before the first factorisation.
         self._known = wp.full((slots, len(indices)), np.nan, dtype=wp.float64, device=device)
-        self._launches: dict[Any, tuple[wp.Launch, Any, wp.array]] = {}
+        self._launch = Launches(device)
         self.bad = wp.zeros(slots, dtype=wp.int32, device=device)
         self._loaded = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
         self.marked = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
@@ -409,41 +407,3 @@ class BatchedFactor:
 
     def _ints(self, values: NDArray[Any]) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=self._device)
-
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[wp.array]) -> None:
-        """Run a kernel, whose first argument is the list of slots.
-
-        All have blocks of one size, so that each module is compiled once. A launch is kept and used
-        again with other slots: to pack twenty arguments takes longer than a small front.
-        """
-        if not np.prod(dim):
-            return
-        key = (kernel.key, *map(_identity, inputs[1:]), *map(_identity, outputs))
-        kept = self._launches.get(key)
-        if kept is None:
-            command = wp.launch(
-                kernel,
-                dim=dim,
-                inputs=inputs,
-                outputs=outputs,
-                block_dim=THREADS,
-                device=self._device,
-                record_cmd=True,
-            )
-            if len(self._launches) == KEPT_LAUNCHES:  # of callers with ever new vectors
-                self._launches.clear()
-        else:
-            command, known_dim, known_slots = kept
-            if known_dim != dim:
-                command.set_dim(dim)
-            if known_slots is not inputs[0]:
-                command.set_param_at_index(0, inputs[0])
-        self._launches[key] = command, dim, inputs[0]
-        command.launch()
-
-
-def _identity(argument: Any) -> Any:
-    """What tells arguments of a launch apart: numbers, and where arrays are."""
-    if isinstance(argument, wp.array):
-        return argument.ptr, argument.shape
-    return argument

@@ -106,7 +106,9 @@ class BatchedFingertip:
         self._steps = BatchedSteps(self.equations, tip.nodes)
         self._on_step: Callable[[int, IndentationStep], None] | None = None
         self._viscosity = np.zeros(slots)
-        self._device = device
+        self._ratios, self._viscosities = (
+            wp.zeros(slots, dtype=wp.float64, device=device) for _ in range(2)
+        )
         self._skin = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
 
     def indent(
@@ -267,8 +269,8 @@ class BatchedFingertip:
                     live[slot].pose, ratio[slot] = wanted.pose, wanted.ratio
                 self._pose(live, begin)
                 listed = self.equations.listed(np.array(begin))
-                ratios = wp.array(ratio, dtype=wp.float64, device=self._device)
-                self._trial.extrapolate(self._now, self._before, ratios, listed.slots)
+                self._ratios.assign(ratio)
+                self._trial.extrapolate(self._now, self._before, self._ratios, listed.slots)
             listed = self.equations.listed(np.array(slots))
             self.equations.correct_contact(self._trial, listed)
             self.equations.balance(self._trial, listed)
@@ -291,8 +293,8 @@ class BatchedFingertip:
                     elastic.append(slot)
             listed = self.equations.listed(np.array(slots))
             anew = self.equations.listed(np.array(elastic)) if elastic else None
-            viscosity = wp.array(self._viscosity, dtype=wp.float64, device=self._device)
-            definite = self.linear.factorise(self._trial, listed, anew, viscosity)
+            self._viscosities.assign(self._viscosity)
+            definite = self.linear.factorise(self._trial, listed, anew, self._viscosities)
             for slot, fine in zip(slots, definite, strict=True):
                 wanted = live[slot].wanted
                 assert isinstance(wanted, Factorise)

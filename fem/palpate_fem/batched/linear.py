@@ -15,6 +15,7 @@ from palpate_fem.arrays import Floats
 from palpate_fem.batched import kernels
 from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.factor import BatchedFactor
+from palpate_fem.batched.launches import Launches
 from palpate_fem.batched.state import BatchedState, Listed
 
 Flags = NDArray[np.bool_]
@@ -43,6 +44,7 @@ class BatchedLinearSystem:
         pattern, device = equations.system.pattern, equations.device
         slots = equations.slots
         self.equations = equations
+        self._launch = Launches(device)
         self._size = len(pattern.free)
         self.factor = BatchedFactor(
             pattern.indptr, pattern.indices, pattern.free // 3, slots=slots, device=device
@@ -111,12 +113,11 @@ class BatchedLinearSystem:
         missing[listed.numbers] = missing_m3
         self._missing.assign(missing)
         self._product(listed, self._border, GRADIENT, self.change, CHANGE, self._moved)
-        wp.launch(
+        self._launch(
             kernels.fluid_pressure_change,
-            dim=len(listed.numbers),
-            inputs=[slots, self._missing, self._moved, self._stiffness],
-            outputs=[self.pressure_change],
-            device=equations.device,
+            len(listed.numbers),
+            [slots, self._missing, self._moved, self._stiffness],
+            [self.pressure_change],
         )
         self._add(listed, self._border, ANSWER, self.pressure_change, self.change, CHANGE)
 
@@ -130,7 +131,7 @@ class BatchedLinearSystem:
         out: wp.array,
     ) -> None:
         count, device = len(listed.numbers), self.equations.device
-        wp.launch(kernels.clear_sums, dim=count, inputs=[listed.slots, out], device=device)
+        self._launch(kernels.clear_sums, count, [listed.slots], [out])
         parts = -(-self._size // kernels.STRETCH)
         wp.launch_tiled(
             kernels.add_products,
@@ -142,21 +143,19 @@ class BatchedLinearSystem:
         )
 
     def _copy(self, listed: Listed, source: wp.array, lane: int, out: wp.array, to: int) -> None:
-        wp.launch(
+        self._launch(
             kernels.copy_lane,
-            dim=(len(listed.numbers), self._size),
-            inputs=[listed.slots, source, lane],
-            outputs=[out, to],
-            device=self.equations.device,
+            (len(listed.numbers), self._size),
+            [listed.slots, source, lane],
+            [out, to],
         )
 
     def _add(
         self, listed: Listed, source: wp.array, lane: int, factor: wp.array, out: wp.array, to: int
     ) -> None:
-        wp.launch(
+        self._launch(
             kernels.add_scaled_lane,
-            dim=(len(listed.numbers), self._size),
-            inputs=[listed.slots, source, lane, factor],
-            outputs=[out, to],
-            device=self.equations.device,
+            (len(listed.numbers), self._size),
+            [listed.slots, source, lane, factor],
+            [out, to],
         )

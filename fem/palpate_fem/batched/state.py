@@ -9,6 +9,7 @@ import warp as wp
 
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.batched import kernels
+from palpate_fem.batched.launches import Launches
 from palpate_fem.mechanics.state import SolutionState
 from palpate_fem.mesh.solid import SolidMesh
 
@@ -74,7 +75,7 @@ class BatchedState:
 
     def __init__(self, mesh: SolidMesh, slots: int, device: str) -> None:
         """Make room; put states before use."""
-        self._rest, self._device = SolutionState.at_rest(mesh), device
+        self._rest, self._launches = SolutionState.at_rest(mesh), Launches(device)
         outer, inner = mesh.outer_faces, mesh.inner_faces
 
         def room(shape: tuple[int, ...], kind: type = wp.float64) -> wp.array:
@@ -131,13 +132,7 @@ class BatchedState:
         outputs: list[wp.array],
     ) -> None:  # fmt: skip
         each = self._each[name]
-        wp.launch(
-            kernel,
-            dim=(len(slots), each),
-            inputs=[slots, each, *inputs],
-            outputs=outputs,
-            device=self._device,
-        )
+        self._launches(kernel, (len(slots), each), [slots, each, *inputs], outputs)
 
 
 def flat(array: wp.array) -> wp.array:

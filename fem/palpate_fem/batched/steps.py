@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,6 +11,7 @@ import warp as wp
 from palpate_fem.arrays import Floats
 from palpate_fem.batched import step_kernels
 from palpate_fem.batched.equations import BatchedEquations
+from palpate_fem.batched.launches import Launches
 from palpate_fem.batched.state import BatchedState, Listed, flat, on_device
 from palpate_fem.batched.step_kernels import (
     AREA,
@@ -39,6 +39,7 @@ class BatchedSteps:
             rest: Nodal positions from which displacements count [m], (V, 3).
         """
         self._equations, self._rest, device = equations, rest, equations.device
+        self._launch = Launches(device)
         mesh, slots = equations.system.mesh, equations.slots
         self._nodes, self._elements = len(mesh.nodes), len(mesh.elements)
         self._stress = wp.zeros(slots * self._elements, dtype=wp.mat33d, device=device)
@@ -168,6 +169,3 @@ class BatchedSteps:
         wp.copy(self._fetched, self._packed, count=count * self._packed.shape[1])
         wp.synchronize_device(equations.device)
         return np.asarray(self._fetched.numpy()[:count])
-
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._equations.device)

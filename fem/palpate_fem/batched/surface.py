@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from palpate_fem.batched import mortar_kernels
+from palpate_fem.batched.launches import Launches
 from palpate_fem.batched.state import on_device
 from palpate_fem.mechanics import contact_kernels
 from palpate_fem.mechanics.contact import ContactSurface
@@ -17,7 +18,7 @@ class BatchedSurface:
     """One surface of all copies: constants of one, results and frozen values of each."""
 
     def __init__(self, surface: ContactSurface, nodes: int, slots: int, device: str) -> None:
-        self._each, self._device = nodes, device
+        self._each, self._launches = nodes, Launches(device)
 
         def room(kind: type, *shape: int) -> wp.array:
             return wp.zeros(shape, dtype=kind, device=device)
@@ -138,4 +139,4 @@ class BatchedSurface:
     def _launch(
         self, kernel: Any, items: wp.array, inputs: list[Any], outputs: list[wp.array]
     ) -> None:
-        wp.launch(kernel, dim=len(items), inputs=inputs, outputs=outputs, device=self._device)
+        self._launches(kernel, len(items), inputs, outputs)
