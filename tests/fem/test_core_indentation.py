@@ -254,6 +254,14 @@ def test_a_request_to_stop_is_honoured_within_an_iteration(
     assert len(trajectory.steps) < len(whole.steps)
 
 
+def test_the_skin_is_back_once_the_indenter_has_left(finger: Fingertip) -> None:
+    path = press_path(finger, 0.4e-3, 0.9e-3, 0.4e-3, -2e-6, -0.1e-3)
+    result = finger.indent(BALL, path)
+    assert result.outcome is IndentationOutcome.COMPLETE
+    left = np.linalg.norm(result.steps[-1].displacement, axis=1).max()
+    assert left < 0.01e-6
+
+
 def test_a_request_to_stop_is_honoured_before_the_skin_is_touched(finger: Fingertip) -> None:
     """Where no increment needs an iteration."""
     path = press_path(finger, *[-2e-6 - 1e-5 * k for k in range(20)])
