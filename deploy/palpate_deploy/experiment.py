@@ -6,17 +6,17 @@ the implementation, and the only place where the two rooms meet.
 
 from __future__ import annotations
 
-import contextlib
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.cluster import RayCluster
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.config import FingertipParameters
 from palpate_fem.electrodes.electronics import (
@@ -27,7 +27,6 @@ from palpate_fem.electrodes.electronics import (
 )
 from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
-from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import parse_segments
 from palpate_fem.population.members import Member, read_population
 from palpate_fem.population.responses import Population, clear_steps
@@ -44,10 +43,9 @@ from palpate_fem.service.device_batch import SLOTS, DeviceBatch, threads_and_pac
 from palpate_fem.service.device_process import check_devices
 from palpate_fem.service.fingertips import skin_of
 from palpate_fem.service.jobs import WorkerSetup
+from palpate_fem.service.ray_batch import RayBatch, cluster_packers
 from palpate_fem.store.content import StoredFingertip
-from palpate_fem.store.files import StoreTakenError
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.writer import StoreWriter, TrajectoryClaim
 from palpate_fem.trajectory import (
     CLEARANCE_M,
     Campaign,
@@ -64,7 +62,6 @@ from palpate_training.experiment.generate.simulator import (
     SimulatedTrajectory,
     Specimen,
 )
-from palpate_training.experiment.generate.workers import RayCluster
 from palpate_training.experiment.plan import (
     INCREMENT_M,
     PlannedManipulation,
@@ -147,29 +144,10 @@ class FilmFactory:
         return cast("PressedSpecimens", Population(self.fingertip, self.units))
 
 
-@dataclass(frozen=True, slots=True)
-class _MechanicsTask:
-    """A trajectory for a machine of a cluster to simulate."""
-
-    spec: ExperimentSpec
-    name: str
-    indenter: str
-    path: Floats
-
-
-def _simulate(task: _MechanicsTask) -> IndentationResult:
-    """Run a trajectory on this process's fingertip."""
-    friction = parameters_of(task.spec).friction_coefficient
-    return _fingertip(task.spec).indent(task.indenter, task.path, friction_coefficient=friction)
-
-
 def _build(spec: ExperimentSpec) -> BiotacTip:
     build: Callable[..., Any] = biotac(**_mesh_options(spec))  # type: ignore[arg-type]
     tip: BiotacTip = build(parameters_of(spec), lambda _: None)
     return tip
-
-
-_fingertip = lru_cache(maxsize=1)(_build)
 
 
 def _presses(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[PlannedIndentation]:
@@ -261,8 +239,9 @@ class FemSimulator:
         on_progress: OnProgress,
         devices: tuple[str, ...] = (),
         slots: int | None = None,
+        cluster: RayCluster | None = None,
     ) -> bool:
-        """Fill the store on this host; what it holds is not run again.
+        """Fill the store; what it holds is not run again, and only this host writes.
 
         Raises:
             DatasetError: The store is another fingertip's or damaged, or the disk refuses.
@@ -270,8 +249,17 @@ class FemSimulator:
             ConfigError: There is no such device.
         """
         setup = WorkerSetup(DEFAULT_FACTORY, _mesh_options(spec), parameters_of(spec), 1)
-        batch: SimulationBatch | DeviceBatch
-        if devices:
+        batch: SimulationBatch | DeviceBatch | RayBatch
+        if cluster is not None:
+            packers = cluster_packers()
+            batch = RayBatch(
+                cluster,
+                setup,
+                device=devices[0] if devices else None,
+                slots=slots or SLOTS,
+                limit_s=LIMIT_S,
+            )
+        elif devices:
             check_devices(devices)
             threads, packers = threads_and_packers(devices)
             batch = DeviceBatch(
@@ -301,44 +289,6 @@ class FemSimulator:
                 packers=packers,
             )
             return not report.stopped
-
-    def simulate_on_cluster(
-        self, spec: ExperimentSpec, store: Path, cluster: RayCluster, *, on_progress: OnProgress
-    ) -> bool:
-        """Fill the store with what the machines of a cluster simulate; this host only writes.
-
-        Raises:
-            DatasetError: The store is another fingertip's or damaged, or the disk refuses.
-            WorkerLostError: The cluster lost machines again and again.
-        """
-        fingertip = self.fingertip(spec)
-        plans = _campaign(spec, fingertip)
-        with StoreWriter(
-            store, fingertip, shared=True, outline=outline_of, command=COMMAND
-        ) as writer:
-            done = writer.done()
-            places: dict[str, TrajectoryClaim] = {}
-
-            def claimed() -> Iterator[_MechanicsTask]:
-                for plan in plans:
-                    if plan.name in done:
-                        continue
-                    # another command may be simulating it
-                    with contextlib.suppress(StoreTakenError):
-                        places[plan.name] = writer.claim(plan.name)
-                        yield _MechanicsTask(spec, plan.name, plan.indenter, plan.path)
-
-            count = len(done)
-            try:
-                for task, trajectory in cluster.run(_simulate, claimed()):
-                    with places.pop(task.name) as place:
-                        place.write(trajectory)
-                    count += 1
-                    on_progress(count, len(plans), trajectory.outcome.value)
-            finally:
-                for place in places.values():
-                    place.close()
-        return True
 
     def open_store(self, path: Path) -> SimulationStore:
         """Open a simulation store."""

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from palpate.cluster import RayCluster, WorkerLostError
 from palpate.errors import ConfigError, DatasetError, LinkError
 from palpate.files.tape import read_tape
 from palpate_deploy.cli.data import twin_app
@@ -36,11 +37,7 @@ from palpate_training.experiment.generate.pipeline import (
 from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
 from palpate_training.experiment.generate.sample import make_sample
 from palpate_training.experiment.generate.simulator import ExperimentSpec, Specimen
-from palpate_training.experiment.generate.workers import (
-    RayCluster,
-    WorkerLostError,
-    WorkerProcesses,
-)
+from palpate_training.experiment.generate.workers import WorkerProcesses
 
 SPEC = ExperimentSpec(
     points=1, angled=1, edge_m=1.2e-3, overtravel_m=0.2e-3, indenters=("sphere_medium",)
@@ -184,12 +181,35 @@ def test_devices_fill_the_same_store(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(SimulationStore.open(tmp_path / STORE).done()) == 2
 
 
+def test_devices_of_a_cluster_fill_the_same_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("ray", reason="needs palpate[cluster]")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "fem"))
+    monkeypatch.setattr("palpate_deploy.experiment.DEFAULT_FACTORY", "fem_fakes:round_finger")
+    told: list[tuple[int, int]] = []
+    with RayCluster("local") as cluster:
+        assert FemSimulator().simulate(
+            SPEC,
+            tmp_path / STORE,
+            workers=1,
+            threads=1,
+            stop=threading.Event(),
+            on_progress=lambda done, total, _: told.append((done, total)),
+            devices=("cpu",),
+            slots=2,
+            cluster=cluster,
+        )
+    assert told == [(1, 2), (2, 2)]
+    assert len(SimulationStore.open(tmp_path / STORE).done()) == 2
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (("--slots", "4"), "--slots without --device"),
         (("--device", "cuda:77"), "cuda:77"),
-        (("--device", "cpu", "--ray", "auto"), "exclude"),
+        (("--device", "cuda:0", "--ray", "auto"), "give cuda"),
     ],
 )
 def test_devices_that_cannot_be_meant_are_refused(
@@ -198,8 +218,6 @@ def test_devices_that_cannot_be_meant_are_refused(
     folder = tmp_path / "twin"
     with pytest.raises(ConfigError, match=said):
         CliRunner().invoke(twin_app, ["generate", str(folder), *words], catch_exceptions=False)
-    with pytest.raises(ConfigError, match="cluster"):
-        generate(folder, SPEC, specimens(), FemSimulator(), workers=1, ray="auto", devices=("cpu",))
     assert not folder.exists()
 
 

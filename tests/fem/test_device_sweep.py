@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import signal
@@ -41,6 +42,7 @@ from palpate_fem.service.device_process import check_devices
 from palpate_fem.service.fingertips import skin_of
 from palpate_fem.service.jobs import WorkerSetup
 from palpate_fem.service.packing import PackingProcesses
+from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter
 from palpate_fem.trajectory import press_path
@@ -103,36 +105,47 @@ def into_store(path: Path, batch: DeviceBatch, plans: Any, **more: Any) -> tuple
         )
 
 
+def three_presses(tip: StoredFingertip) -> list[PlannedPath]:
+    """Shallow ones on the real finger."""
+    plans: list[PlannedPath] = []
+    for name, x in (("sphere_medium", -4e-3), ("cube", -4e-3), ("sphere_medium", -5e-3)):
+        path = press_path(
+            make_indenter(name), (x, 0.0, -7.5e-3), (0.0, 0.0, 1.0), skin_of(tip),
+            depth_m=0.4e-3, steps=2,
+        )  # fmt: skip
+        plans.append(PlannedPath(f"{name}/{len(plans):02}/normal", name, path))
+    return plans
+
+
+def check_same(ours: Path, theirs: Path, plans: list[PlannedPath]) -> None:
+    """Two stores hold the same trajectories, and just these."""
+    found, wanted = SimulationStore.open(ours), SimulationStore.open(theirs)
+    assert sorted(found.ids()) == sorted(plan.name for plan in plans)
+    assert found.fingertip().key == wanted.fingertip().key
+    for name in found.ids():
+        one, other = found.trajectory(name), wanted.trajectory(name)
+        assert (one.outcome, one.indenter) == (other.outcome, other.indenter)
+        size = np.linalg.norm(other.forces[-1])
+        assert np.abs(one.forces - other.forces).max() < SAME * size
+        assert found.outline(name) is not None
+
+
 def test_the_store_of_a_device_is_that_of_the_cpu(tmp_path: Path) -> None:
     """The real solver, on two devices; both share the work, and one press begins in the skin."""
     with DeviceBatch(REAL, [DEVICE, DEVICE], slots=2, threads=1) as batch:
         tip = batch.fingertip(threading.Event())
         assert tip is not None
-        plans: list[PlannedPath] = []
-        for name, x in (("sphere_medium", -4e-3), ("cube", -4e-3), ("sphere_medium", -5e-3)):
-            path = press_path(
-                make_indenter(name), (x, 0.0, -7.5e-3), (0.0, 0.0, 1.0), skin_of(tip),
-                depth_m=0.4e-3, steps=2,
-            )  # fmt: skip
-            plans.append(PlannedPath(f"{name}/{len(plans):02}/normal", name, path))
-        plans.append(PlannedPath(INSIDE, "sphere_medium", plans[0].path[::-1]))
+        plans = three_presses(tip)
+        inside = PlannedPath(INSIDE, "sphere_medium", plans[0].path[::-1])
         report, _ = sweep_into_store(
-            batch, plans, tmp_path / "a.sim", stop=threading.Event(), packers=1
+            batch, [*plans, inside], tmp_path / "a.sim", stop=threading.Event(), packers=1
         )
     assert dict(report.outcomes) == {"complete": 3, "failed": 1}
     (early,) = report.early
     assert (early.name, "inside the skin" in early.reason) == (INSIDE, True)
     with SimulationBatch(REAL, workers=1, threads=1) as one_by_one:
         sweep_into_store(one_by_one, plans, tmp_path / "b.sim", stop=threading.Event())
-    found, wanted = (SimulationStore.open(tmp_path / name) for name in ("a.sim", "b.sim"))
-    assert sorted(found.ids()) == sorted(plan.name for plan in plans[:3])
-    assert found.fingertip().key == wanted.fingertip().key
-    for name in found.ids():
-        ours, theirs = found.trajectory(name), wanted.trajectory(name)
-        assert (ours.outcome, ours.indenter) == (theirs.outcome, theirs.indenter)
-        size = np.linalg.norm(theirs.forces[-1])
-        assert np.abs(ours.forces - theirs.forces).max() < SAME * size
-        assert found.outline(name) is not None
+    check_same(tmp_path / "a.sim", tmp_path / "b.sim", plans)
 
 
 def hard(count: int) -> list[PlannedPath]:
@@ -176,7 +189,7 @@ def test_only_what_needs_the_cpu_fails_without_it(broken: str, said: str) -> Non
 
 def test_hard_ones_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Devices get no new ones while too many wait for the CPU: each has a file open."""
-    monkeypatch.setattr(device_batch, "_ON_CPU_MOST", 1)
+    monkeypatch.setattr(device_batch, "ON_CPU_MOST", 1)
     batch, taken, most = batch_of(fakes.UNSOLVED, slots=1), 0, 0
 
     def supplied() -> Any:
@@ -267,6 +280,15 @@ def test_a_lost_device_loses_nothing(number: int, devices: int) -> None:
     assert (report.outcomes["complete"], report.done, len(kept)) == (9, 9, 9)
 
 
+def test_what_the_only_device_had_last_is_not_forgotten() -> None:
+    """It is lost when all have been handed out: then nothing is open, but not all is done."""
+    batch = batch_of(fakes.SLOW)
+    on_report, sent = signalled(batch, signal.SIGKILL, 4)
+    report, kept = run(batch, short(7), on_report)
+    assert sent
+    assert (report.outcomes["complete"], report.done, len(kept)) == (7, 7, 7)
+
+
 @pytest.mark.parametrize(
     ("kind", "said"),
     [("DIES", "exit status 7, again"), ("STUBBORN", "silent"), ("DEFECTIVE", "a defect")],
@@ -323,7 +345,8 @@ def test_what_was_done_before_the_last_device_died_is_kept(tmp_path: Path) -> No
     path, batch = tmp_path / "a.sim", batch_of(fakes.SLOW)
 
     def on_report(report: BatchReport) -> None:
-        os.kill(batch.pids[0], signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):  # it is gone, and that is not noticed yet
+            os.kill(batch.pids[0], signal.SIGKILL)
 
     with pytest.raises(RemoteError, match="SIGKILL"):
         into_store(path, batch, short(20), on_report=on_report)
@@ -336,7 +359,7 @@ def test_what_was_done_before_the_last_device_died_is_kept(tmp_path: Path) -> No
 
 KILLED = """
 import sys
-sys.path.insert(0, {folder!r})
+sys.path[:0] = {folders!r}
 from test_device_sweep import batch_of, fakes, into_store, short
 from pathlib import Path
 into_store(Path({store!r}), batch_of(fakes.SLOW, 2), short(90))
@@ -346,7 +369,8 @@ into_store(Path({store!r}), batch_of(fakes.SLOW, 2), short(90))
 def test_a_killed_sweep_leaves_no_process_and_a_good_store(tmp_path: Path) -> None:
     """Written without a guard for the main module, as a robot programmer would."""
     store, script = tmp_path / "a.sim", tmp_path / "script.py"
-    script.write_text(KILLED.format(folder=str(Path(__file__).parent), store=str(store)))
+    folders = [str(Path(__file__).parents[up]) for up in (0, 2)]
+    script.write_text(KILLED.format(folders=folders, store=str(store)))
     process = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
     deadline = time.monotonic() + PATIENCE_S
     while len(list(store.rglob("*normal.h5"))) < 3:

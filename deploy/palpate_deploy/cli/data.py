@@ -129,14 +129,17 @@ def data_generate(
     ] = 0,
     ray: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Work on a Ray cluster: HOST:PORT, auto or local."),
+        typer.Option(
+            metavar="ADDRESS", help="Work on a Ray cluster's CPUs: HOST:PORT, auto or local."
+        ),
     ] = None,
     device: Annotated[
         list[str] | None,
         typer.Option(
             "--device",
             metavar="NAME",
-            help="Solve many trajectories at once on this device: cuda:0, ..., or cpu; repeatable.",
+            help="Solve many trajectories at once on this device: cuda:0, ..., or cpu; repeatable. "
+            "With --ray: cuda = on each GPU of the cluster.",
         ),
     ] = None,
     slots: Annotated[
@@ -152,21 +155,11 @@ def data_generate(
     from palpate_fem.config import LIMITS
     from palpate_fem.indenter.catalogue import make_indenter
     from palpate_fem.indenter.path import parse_segments, show_segments
-    from palpate_fem.service.device_process import check_devices
+    from palpate_fem.service.device_process import check_places
     from palpate_training.experiment.generate.pipeline import generate as run
     from palpate_training.experiment.generate.simulator import ExperimentSpec
 
-    if slots is not None and not device:
-        raise ConfigError(
-            "--slots without --device", remedy="name the device, e.g. --device cuda:0"
-        )
-    if device and ray is not None:
-        raise ConfigError(
-            "--ray and --device exclude each other: a cluster computes on its CPUs",
-            remedy="give one",
-        )
-    if device:
-        check_devices(device)
+    check_places(device or (), slots, ray)
     low, high = LIMITS["fluid_volume_m3"]
     if not low < fill_ml * 1e-6 <= high:
         raise typer.BadParameter(f"{fill_ml} ml is not within {low * 1e6:g} to {high * 1e6:g}")

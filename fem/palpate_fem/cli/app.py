@@ -64,7 +64,16 @@ DeviceOption = Annotated[
         "--device",
         metavar="NAME",
         help="--sweep: solve many trajectories at once on this device (cuda:0, ..., or cpu); "
-        "repeatable. --workers are then the processes that make files.",
+        "repeatable. With --ray: cuda = on each GPU of the cluster. --workers are then the "
+        "processes that make files.",
+    ),
+]
+RayOption = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        metavar="ADDRESS",
+        help="--sweep: on the machines of a Ray cluster: HOST:PORT, auto or local.",
     ),
 ]
 SlotsOption = Annotated[
@@ -127,6 +136,7 @@ def _example(*lines: str) -> str:
         'palpate fem run --path "press 2 mm, slide 1.5 mm towards +y, twist 20 deg, unload"',
         "palpate fem run --sweep --points 2 --store runs/paper.sim",
         "palpate fem run --sweep --store runs/paper.sim --device cuda:0 --device cuda:1",
+        "palpate fem run --sweep --store runs/paper.sim --ray head:6379 --device cuda",
     )
 )
 def run(
@@ -186,6 +196,7 @@ def run(
     workers: WorkersOption = 0,
     device: DeviceOption = None,
     slots: SlotsOption = None,
+    ray: RayOption = None,
     mesh: MeshOption = "biotac",
     edge_mm: EdgeOption = None,
     layers: LayersOption = 2,
@@ -223,6 +234,7 @@ def run(
                 as_json=json_,
                 devices=tuple(device or ()),
                 slots=slots,
+                ray=ray,
             ),
             model_of(
                 mesh=mesh,

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from palpate.errors import ConfigError
 from palpate_fem.config import FingertipParameters
-from palpate_fem.service.batch import SimulationBatch
+from palpate_fem.service.batch import SimulationBatch, TrajectoryBatch
 from palpate_fem.service.config import DEFAULT_FACTORY
 from palpate_fem.service.device_batch import SLOTS, DeviceBatch, threads_and_packers
 from palpate_fem.service.jobs import WorkerSetup
+from palpate_fem.service.ray_batch import cluster_packers, ray_batch
 
 PARAMETRIC = "biotac"
 
@@ -44,21 +46,28 @@ class FingertipModel:
         limit_s: float,
         devices: Sequence[str] = (),
         slots: int | None = None,
-    ) -> tuple[Callable[[], SimulationBatch | DeviceBatch], int]:
+        ray: str | None = None,
+    ) -> tuple[Callable[[], AbstractContextManager[TrajectoryBatch]], int]:
         """What starts the processes that run trajectories, and how many make files of them.
 
         Args:
-            workers: Requested number, as in `workers_for`; with devices, of those that make files.
+            workers: Requested number, as in `workers_for`; with devices or a cluster, of those that
+                make files.
             jobs: Number of trajectories, if it is known.
             limit_s: Longest time for one [s].
             devices: Warp devices that solve many trajectories at once; none = the CPU.
             slots: Trajectories at once on each device; None = the usual number.
+            ray: Address of a cluster on which they run; ``devices`` are then its.
         """
         setup = self.setup()
+        if ray is not None:
+            device = devices[0] if devices else None
+            make = partial(ray_batch, ray, setup, device=device, slots=slots or SLOTS)
+            return partial(make, limit_s=limit_s), cluster_packers(workers)
         if devices:
             threads, packers = threads_and_packers(devices, workers)
-            make = partial(DeviceBatch, setup, devices, slots=slots or SLOTS)
-            return partial(make, threads=threads, limit_s=limit_s), packers
+            batch = partial(DeviceBatch, setup, devices, slots=slots or SLOTS)
+            return partial(batch, threads=threads, limit_s=limit_s), packers
         count, threads = workers_for(workers, jobs)
         return partial(SimulationBatch, setup, workers=count, threads=threads, limit_s=limit_s), 0
 

@@ -44,7 +44,7 @@ from palpate_fem.service.batch import (
     TrajectoryPlan,
     sweep_into_store,
 )
-from palpate_fem.service.device_process import check_devices, wanted_device
+from palpate_fem.service.device_process import check_places, wanted_device
 from palpate_fem.service.fingertips import check_start, skin_of
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
 from palpate_fem.store.read import SimulationStore
@@ -94,6 +94,7 @@ class RunOptions:
     as_json: bool
     devices: tuple[str, ...] = ()
     slots: int | None = None
+    ray: str | None = None
 
     def check(self) -> None:
         """Refuse what can be refused before a fingertip is built.
@@ -111,16 +112,14 @@ class RunOptions:
             raise ConfigError(
                 "a sweep takes long and its results must be stored", remedy="give --store NAME.sim"
             )
-        for name, value in (("--device", self.devices), ("--slots", self.slots)):
+        places = {"--device": self.devices, "--slots": self.slots, "--ray": self.ray}
+        for name, value in places.items():
             if value and not self.sweep:
                 raise ConfigError(
-                    f"{name} without --sweep: a device pays for many trajectories at once",
+                    f"{name} without --sweep: it pays for many trajectories only",
                     remedy="add --sweep, or leave it out",
                 )
-        if self.slots is not None and not self.devices:
-            raise ConfigError("--slots without --device", remedy=_NAME_THE_DEVICE)
-        if self.devices:
-            check_devices(self.devices)
+        check_places(self.devices, self.slots, self.ray)
         if self.store is not None and self.store.suffix != SUFFIX:
             raise ConfigError(
                 f"--store {self.store} does not end in {SUFFIX}",
@@ -143,6 +142,13 @@ class RunOptions:
             parse_segments(self.path)
         if self.poses is not None:
             read_path(self.poses)
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Where many trajectories are solved, for the summary; empty = in processes of the CPU."""
+        if self.ray is None:
+            return self.devices
+        return (f"the {'GPUs' if 'cuda' in self.devices else 'CPUs'} of the Ray cluster",)
 
     def plans(self, fingertip: StoredFingertip) -> Sequence[TrajectoryPlan]:
         """The trajectories to run on a fingertip."""
@@ -191,6 +197,7 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
         limit_s=options.limit_s,
         devices=options.devices,
         slots=options.slots,
+        ray=options.ray,
     )
     done: list[IndentationResult] = []
     present = 0
@@ -236,14 +243,14 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
         there = set(opened.ids())
         done = [opened.trajectory(plan.name) for plan in plans if plan.name in there]
     if options.as_json:
-        write_json(fingertip, done, report, present, options.devices)
+        write_json(fingertip, done, report, present, options.places)
     else:
         if sweep:
             assert store is not None
             show_summaries(store, [plan.name for plan in plans])
         for trajectory in done:
             show_trajectory(fingertip, trajectory)
-        show_report(report, present, store, options.devices)
+        show_report(report, present, store, options.places)
     if options.png is not None:
         _draw(options.png, fingertip, done, store if sweep else None)
     return 0 if not report.stopped and all(early.how in GOOD for early in report.early) else 1
@@ -392,9 +399,9 @@ def show_summaries(store: Path, names: Sequence[str]) -> None:
 
 
 def show_report(
-    report: BatchReport, present: int, store: Path | None, devices: Sequence[str] = ()
+    report: BatchReport, present: int, store: Path | None, places: Sequence[str] = ()
 ) -> None:
-    """Print every early end, and a summary; with devices also how quick they were."""
+    """Print every early end, and a summary; with places also how quick these were."""
     if report.early:
         more = len(report.early) - _SHOWN_EARLY
         print_table(
@@ -410,9 +417,9 @@ def show_report(
     parts = [f"{report.done} of {report.total} run" + (f": {outcomes}" if outcomes else "")]
     if present:
         parts.append(f"{present} were there already")
-    if devices and report.done:
+    if places and report.done:
         each_ms = report.wall_s / report.done * 1e3
-        parts.append(f"{each_ms:.0f} ms a trajectory on {', '.join(devices)}")
+        parts.append(f"{each_ms:.0f} ms a trajectory on {', '.join(places)}")
     if report.on_cpu:
         parts.append(f"{report.on_cpu} of them on the CPU, as the device did not solve them")
     if report.stopped:
@@ -427,7 +434,7 @@ def write_json(
     trajectories: Sequence[IndentationResult],
     report: BatchReport,
     present: int,
-    devices: Sequence[str],
+    places: Sequence[str],
 ) -> None:
     """Print everything except nodal fields as JSON on stdout."""
     content = {
@@ -443,7 +450,7 @@ def write_json(
         "outcomes": dict(report.outcomes),
         "present": present,
         "stopped": report.stopped,
-        "devices": list(devices),
+        "devices": list(places),
         "on_cpu": report.on_cpu,
         "wall_s": report.wall_s,
         "early": [asdict(early) for early in report.early],

@@ -1,4 +1,4 @@
-"""Many trajectories on GPUs: a process for each device, which solves them in slots.
+"""Many trajectories on this host's GPUs: a process for each, which solves them in slots.
 
 A process that dies or hangs costs nobody's trajectories: the other devices get them; the last one
 is started once more. What a device does not solve goes to worker processes on the CPU.
@@ -13,9 +13,11 @@ import os
 import queue
 import threading
 import time
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 from palpate.errors import ConfigError, ErrorCode, RemoteError
 from palpate.process import Closing
@@ -31,6 +33,7 @@ from palpate_fem.service.batch import (
 from palpate_fem.service.device_process import HANG_S, START_S, DeviceProcess
 from palpate_fem.service.jobs import (
     DeviceEvent,
+    DeviceReady,
     DeviceSetup,
     JobEnded,
     JobEvent,
@@ -53,11 +56,17 @@ _log = logging.getLogger(__name__)
 SLOTS = 128
 """Trajectories at once on a device: more gain little there, and each takes 232 MiB."""
 
-_SLOTFULS = 2  # of trajectories that a device has: one at work, one that waits
-_POLL_S = 0.1
+SLOTFULS = 2
+"""Times its slots that a device has trajectories: as many wait there as are at work."""
+
+ON_CPU_MOST = 256
+"""Trajectories that run or wait on CPUs; then devices get no new ones."""
+
+POLL_S = 0.1
+"""Longest wait for an event before other things are looked at [s]."""
+
 _THREADS_MOST = 4  # the fingertip is made on the CPU, and takes little more
 _WORKERS_MOST = 16  # few trajectories need the CPU
-_ON_CPU_MOST = 256  # that run or wait there; then devices get no new ones
 
 
 def threads_and_packers(devices: Sequence[str], packers: int = 0) -> tuple[int, int]:
@@ -93,17 +102,62 @@ class _Supply:
         return next(self._numbers), plan
 
 
+class BusyDevice(Protocol):
+    """A device as a batch sees it; see `DeviceProcess`."""
+
+    open: dict[int, TrajectoryPlan]
+    ready: bool
+    warm: bool
+    last_words: JobFailed | None
+
+    def give(self, press: NumberedPress, owner: TrajectoryPlan, /) -> None:
+        """Give it a trajectory."""
+
+    def send(self, message: object, /) -> None:
+        """Send it a message; lost if it has ended."""
+
+    def kill(self) -> None:
+        """End it now."""
+
+    def join(self) -> None:
+        """Wait until it has ended."""
+
+    def why_it_ended(self) -> str:
+        """The end of an error message."""
+        ...
+
+
+Device = TypeVar("Device", bound=BusyDevice)
+
+
 @dataclass(frozen=True, slots=True)
-class _PlanEnded:
+class PlanEnded:
     """The end of a trajectory, its steps, and the device that has solved it; None = another end."""
 
     plan: TrajectoryPlan
     end: JobEnded | JobFailed
     steps: Sequence[IndentationStep] = ()
-    device: DeviceProcess[TrajectoryPlan] | None = None
+    device: BusyDevice | None = None
 
 
-class CpuShare(Closing):
+class CpuShare(Protocol):
+    """Solves on CPUs what devices do not."""
+
+    @property
+    def open(self) -> int:
+        """Trajectories that run or wait."""
+
+    def put(self, plan: TrajectoryPlan) -> None:
+        """Solve a trajectory when there is room."""
+
+    def hand_out(self) -> None:
+        """Start what waits, if there is room; to be called often."""
+
+    def close(self) -> None:
+        """Drop what runs or waits."""
+
+
+class WorkerShare(Closing):
     """What devices do not solve: in worker processes, which start when there is something.
 
     Args:
@@ -116,7 +170,7 @@ class CpuShare(Closing):
     """
 
     def __init__(
-        self, setup: WorkerSetup, limit_s: float, on_end: Callable[[_PlanEnded], None]
+        self, setup: WorkerSetup, limit_s: float, on_end: Callable[[PlanEnded], None]
     ) -> None:
         self._setup, self._limit_s, self._on_end = setup, limit_s, on_end
         self._waiting: deque[TrajectoryPlan] = deque()
@@ -154,16 +208,157 @@ class CpuShare(Closing):
             if isinstance(event, StepConverged):
                 steps.append(event.step)
             elif isinstance(event, JobEnded | JobFailed):
-                self._on_end(_PlanEnded(plan, event, steps))
+                self._on_end(PlanEnded(plan, event, steps))
 
         job = SimulationJob(plan.name, self._setup.warm, plan.indenter, plan.path, self._limit_s)
         try:
             pool.submit(job, on_event)
         except RemoteError as error:
-            self._on_end(_PlanEnded(plan, JobFailed.of(error)))
+            self._on_end(PlanEnded(plan, JobFailed.of(error)))
 
 
-class DeviceBatch(Closing):
+class SlottedBatch(Closing, Generic[Device]):
+    """A `TrajectoryBatch` on devices that solve many trajectories at once, whatever carries them.
+
+    Args:
+        slots: Trajectories at once on each device.
+        cpu: Solves what they do not.
+
+    Raises:
+        ConfigError: There are no slots.
+    """
+
+    ahead: int
+    _has_devices = True  # else it is a matter of course that CPUs solve all
+
+    def __init__(self, slots: int, cpu: CpuShare) -> None:
+        if slots < 1:
+            raise ConfigError(f"{slots} slots", remedy="give one or more")
+        self._slots, self._cpu = slots, cpu
+        self._devices: list[Device] = []
+        self._first: StoredFingertip | None = None
+        self._supply = _Supply(())
+        self._closing = False
+
+    @abstractmethod
+    def _receive(self) -> tuple[Device, DeviceEvent | None] | PlanEnded | None:
+        """Wait a moment for an event of a device, None of one that is gone, or an end on the CPU.
+
+        Raises:
+            RemoteError: There are no devices any more; says why.
+        """
+
+    @abstractmethod
+    def _on_gone(self, device: Device) -> None:
+        """Take a lost device from the others, and see to its trajectories.
+
+        Raises:
+            RemoteError: It was the last one; says why.
+        """
+
+    def fingertip(self, stop: threading.Event) -> StoredFingertip | None:
+        """See ``TrajectoryBatch.fingertip``."""
+        while self._first is None and not stop.is_set():
+            self._next()
+        return self._first
+
+    def run(
+        self,
+        plans: Iterable[TrajectoryPlan],
+        total: int,
+        *,
+        stop: threading.Event,
+        on_trajectory: OnTrajectory,
+        on_report: OnReport | None = None,
+    ) -> BatchReport:
+        """See ``TrajectoryBatch.run``.
+
+        A trajectory that begins inside the skin, or whose path is not valid, counts as failed.
+        When ``stop`` is set the devices end, so nothing can be run any more.
+        """
+        self._supply = supply = _Supply(plans)
+        report, began = BatchReport(total), time.monotonic()
+        while True:
+            if stop.is_set():
+                report.stopped = True
+                self.close()
+                break
+            self._hand_out(total)
+            if supply.used_up and not (supply.given_back or self._open):
+                break
+            ended = self._next()
+            if ended is None:
+                continue
+            account_for(report, ended.plan, ended.end, ended.steps, on_trajectory)
+            if ended.device is not None:
+                ended.device.send(ResultTaken())
+            elif isinstance(ended.end, JobEnded):
+                report.on_cpu += self._has_devices
+            if on_report is not None:
+                on_report(report)
+        report.wall_s = time.monotonic() - began
+        return report
+
+    def close(self) -> None:
+        """End the devices' processes; may be called again."""
+        self._closing = True
+        for device in self._devices:
+            device.kill()
+        for device in self._devices:
+            device.join()
+        self._cpu.close()
+
+    @property
+    def _open(self) -> int:
+        """Trajectories that are taken and have not ended, but for those given back."""
+        return sum(len(device.open) for device in self._devices) + self._cpu.open
+
+    def _hand_out(self, total: int) -> None:
+        """Fill the devices, the emptiest first, and the CPU."""
+        self._cpu.hand_out()
+        # What one has in store another cannot solve: a small batch is shared evenly.
+        share = math.ceil(total / max(1, len(self._devices)))
+        most = max(1, min(SLOTFULS * self._slots, share))
+        while self._open < self.ahead:
+            free = [one for one in self._devices if one.ready and len(one.open) < most]
+            found = self._supply.next() if free else None
+            if found is None:
+                return
+            number, plan = found
+            emptiest = min(free, key=lambda one: len(one.open))
+            emptiest.give(NumberedPress(number, plan.indenter, plan.path), plan)
+
+    def _next(self) -> PlanEnded | None:
+        """Wait a moment for the end of a trajectory, and see to the devices.
+
+        Raises:
+            RemoteError: The last one is gone; says why.
+        """
+        found = self._receive()
+        if found is None or isinstance(found, PlanEnded):
+            return found
+        device, event = found
+        match event:
+            case PressEnded(number, result):
+                plan = device.open.pop(number)
+                return PlanEnded(plan, JobEnded.of(result), result.steps, device)
+            case PressRefused(number, failed):
+                return PlanEnded(device.open.pop(number), failed)
+            case PressUnsolved(number):
+                self._cpu.put(device.open.pop(number))
+            case JobStarted(fingertip):
+                device.ready = True
+                self._first = self._first or fingertip
+            case DeviceReady():
+                device.warm = True
+            case JobFailed():
+                device.last_words = event
+            case None:
+                self._on_gone(device)
+        return None
+
+
+class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
     """Runs trajectories on fingertips with one set of parameters, on devices; a `TrajectoryBatch`.
 
     Args:
@@ -191,90 +386,28 @@ class DeviceBatch(Closing):
         hang_s: float = HANG_S,
         start_s: float = START_S,
     ) -> None:
-        if not devices or slots < 1:
-            raise ConfigError(
-                f"{len(devices)} devices with {slots} slots", remedy="give one or more of each"
-            )
-        self.ahead = _SLOTFULS * slots * len(devices) + _ON_CPU_MOST
-        self._setup, self._slots, self._threads = setup, slots, threads
-        self._hang_s, self._start_s = hang_s, start_s
-        self._first: StoredFingertip | None = None
-        self._supply = _Supply(())
-        self._again = False  # whether the last one was started once more
-        self._closing = False
+        if not devices:
+            raise ConfigError("no devices", remedy="give one or more")
         self._events: queue.SimpleQueue[
-            tuple[DeviceProcess[TrajectoryPlan], DeviceEvent | None] | _PlanEnded
+            tuple[DeviceProcess[TrajectoryPlan], DeviceEvent | None] | PlanEnded
         ] = queue.SimpleQueue()
-        self._cpu = CpuShare(setup, limit_s, self._events.put)
-        self._processes: list[DeviceProcess[TrajectoryPlan]] = []
+        self._workers = WorkerShare(setup, limit_s, self._events.put)
+        super().__init__(slots, self._workers)
+        self.ahead = SLOTFULS * slots * len(devices) + ON_CPU_MOST
+        self._setup, self._threads = setup, threads
+        self._hang_s, self._start_s = hang_s, start_s
+        self._again = False  # whether the last one was started once more
         for device in devices:
             self._start(device)
 
     @property
     def pids(self) -> list[int]:
         """Process ids of the devices that are left, in order."""
-        return [process.pid for process in self._processes]
-
-    def fingertip(self, stop: threading.Event) -> StoredFingertip | None:
-        """See ``TrajectoryBatch.fingertip``."""
-        while self._first is None and not stop.is_set():
-            self._next()
-        return self._first
-
-    def run(
-        self,
-        plans: Iterable[TrajectoryPlan],
-        total: int,
-        *,
-        stop: threading.Event,
-        on_trajectory: OnTrajectory,
-        on_report: OnReport | None = None,
-    ) -> BatchReport:
-        """See ``TrajectoryBatch.run``.
-
-        A trajectory that begins inside the skin, or whose path is not valid, counts as failed.
-        When ``stop`` is set the processes end, so nothing can be run any more.
-        """
-        self._supply = supply = _Supply(plans)
-        report, began = BatchReport(total), time.monotonic()
-        while True:
-            if stop.is_set():
-                report.stopped = True
-                self.close()
-                break
-            self._hand_out(total)
-            if supply.used_up and not self._open:
-                break
-            ended = self._next()
-            if ended is None:
-                continue
-            account_for(report, ended.plan, ended.end, ended.steps, on_trajectory)
-            if ended.device is not None:
-                ended.device.send(ResultTaken())
-            elif isinstance(ended.end, JobEnded):
-                report.on_cpu += 1
-            if on_report is not None:
-                on_report(report)
-        report.wall_s = time.monotonic() - began
-        return report
-
-    def close(self) -> None:
-        """End the processes; may be called again."""
-        self._closing = True
-        for process in self._processes:
-            process.kill()
-        for process in self._processes:
-            process.join()
-        self._cpu.close()
-
-    @property
-    def _open(self) -> int:
-        """Trajectories that are taken and have not ended, but for those given back."""
-        return sum(len(process.open) for process in self._processes) + self._cpu.open
+        return [process.pid for process in self._devices]
 
     def _start(self, device: str) -> None:
         setup = DeviceSetup(self._setup, device, self._slots, indenter_names())
-        self._processes.append(
+        self._devices.append(
             DeviceProcess(
                 setup,
                 self._threads,
@@ -284,63 +417,28 @@ class DeviceBatch(Closing):
             )
         )
 
-    def _hand_out(self, total: int) -> None:
-        """Fill the devices, the emptiest first, and the CPU."""
-        self._cpu.hand_out()
-        # What one has in store another cannot solve: a small batch is shared evenly.
-        share = math.ceil(total / max(1, len(self._processes)))
-        most = max(1, min(_SLOTFULS * self._slots, share))
-        while self._open < self.ahead:
-            free = [one for one in self._processes if one.ready and len(one.open) < most]
-            found = self._supply.next() if free else None
-            if found is None:
-                return
-            number, plan = found
-            emptiest = min(free, key=lambda one: len(one.open))
-            emptiest.give(NumberedPress(number, plan.indenter, plan.path), plan)
-
-    def _next(self) -> _PlanEnded | None:
-        """Wait a moment for the end of a trajectory, and see to the processes.
-
-        Raises:
-            RemoteError: The last one is gone; says why.
-        """
-        for process in self._processes:
+    def _receive(
+        self,
+    ) -> tuple[DeviceProcess[TrajectoryPlan], DeviceEvent | None] | PlanEnded | None:
+        for process in self._devices:
             process.end_if_hung()
         try:
-            found = self._events.get(timeout=_POLL_S)
+            found = self._events.get(timeout=POLL_S)
         except queue.Empty:
             return None
-        if isinstance(found, _PlanEnded):
-            self._cpu.open -= 1
-            return found
-        process, event = found
-        match event:
-            case PressEnded(number, result):
-                plan = process.open.pop(number)
-                return _PlanEnded(plan, JobEnded.of(result), result.steps, process)
-            case PressRefused(number, failed):
-                return _PlanEnded(process.open.pop(number), failed)
-            case PressUnsolved(number):
-                self._cpu.put(process.open.pop(number))
-            case JobStarted(fingertip):
-                process.ready = True
-                self._first = self._first or fingertip
-            case JobFailed():
-                process.last_words = event
-            case None:
-                self._on_gone(process)
-        return None
+        if isinstance(found, PlanEnded):
+            self._workers.open -= 1
+        return found
 
     def _on_gone(self, process: DeviceProcess[TrajectoryPlan]) -> None:
         """Give back what a process had; start it again if it was the last."""
-        self._processes.remove(process)
+        self._devices.remove(process)
         self._supply.given_back.extend(process.open.items())
         why, said = process.why_it_ended(), process.last_words
         if self._closing:
             return
         _log.warning("the solver on %s %s", process.device, why)
-        if self._processes:
+        if self._devices:
             return
         # One that says why it does not start would say it again.
         if self._again or (said is not None and not process.warm):

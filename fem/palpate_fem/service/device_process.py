@@ -23,6 +23,9 @@ HANG_S = 120.0
 START_S = 900.0
 """The same before a process is ready [s]: kernels are compiled until then, which takes minutes."""
 
+ON_CLUSTER = ("cuda", "cpu")
+"""Devices of a cluster: each of its GPUs, or for tests its CPUs."""
+
 AUTO = "auto"
 """Instead of a device: the first GPU, or none."""
 
@@ -45,6 +48,26 @@ def check_devices(names: Sequence[str]) -> None:
                 f"there is no device {name!r}",
                 remedy=f"give one of: {', '.join(known)}; if a GPU is missing, see nvidia-smi",
             )
+
+
+def check_places(devices: Sequence[str], slots: int | None, ray: str | None) -> None:
+    """Check the options ``--device``, ``--slots`` and ``--ray`` of a command.
+
+    Raises:
+        ConfigError: They cannot be meant together, or there is no such device.
+    """
+    if slots is not None and not devices:
+        raise ConfigError(
+            "--slots without --device",
+            remedy="name the device, e.g. --device cuda" + ("" if ray is not None else ":0"),
+        )
+    if ray is None:
+        check_devices(devices)
+    elif devices and (len(devices) > 1 or devices[0] not in ON_CLUSTER):
+        raise ConfigError(
+            f"--device {' and '.join(devices)} with --ray",
+            remedy="give cuda: it means every GPU of the cluster; or leave it out for its CPUs",
+        )
 
 
 def wanted_device(name: str | None) -> str | None:

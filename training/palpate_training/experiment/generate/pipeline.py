@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate import __version__
+from palpate.cluster import RayCluster
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
 from palpate_training.datasets.container import Provenance
@@ -28,7 +29,7 @@ from palpate_training.experiment.generate.simulator import (
     TwinSimulator,
 )
 from palpate_training.experiment.generate.trials import make_trials
-from palpate_training.experiment.generate.workers import RayCluster, TaskRunner, WorkerProcesses
+from palpate_training.experiment.generate.workers import TaskRunner, WorkerProcesses
 
 EXPERIMENT, MIXED = "experiment.h5", "mixed.h5"
 STORE = "mechanics.sim"
@@ -94,7 +95,7 @@ def generate(
         workers: Processes.
         threads: Threads of each solver.
         ray: Address of a Ray cluster that works instead of this host's processes.
-        devices: Devices of this host that solve the trajectories, not ``workers``.
+        devices: Devices of this host, or of the cluster, that solve the trajectories.
         slots: Trajectories at once on each device; None = as many as the simulator thinks best.
         stop: Set it to end early.
         on_stage: Called with the progress of each stage.
@@ -104,13 +105,10 @@ def generate(
         What came out; None = stopped.
 
     Raises:
-        ConfigError: The folder holds another experiment, or both a cluster and devices are given.
+        ConfigError: The folder holds another experiment, or there are no such devices.
+        LinkError: No cluster answers.
         DatasetError: What is there is damaged, or the disk refuses.
     """
-    if ray is not None and devices:
-        raise ConfigError(
-            "a Ray cluster does not use the devices of this host", remedy="leave one of them out"
-        )
     stop = stop or threading.Event()
     keep_spec(folder, spec, specimens)
     seconds: dict[str, float] = {}
@@ -118,21 +116,17 @@ def generate(
     try:
         began = time.monotonic()
         path = folder / STORE
-        if cluster is not None:
-            complete = simulator.simulate_on_cluster(
-                spec, path, cluster, on_progress=partial(on_stage, "mechanics")
-            )
-        else:
-            complete = simulator.simulate(
-                spec,
-                path,
-                workers=workers,
-                threads=threads,
-                stop=stop,
-                on_progress=partial(on_stage, "mechanics"),
-                devices=devices,
-                slots=slots,
-            )
+        complete = simulator.simulate(
+            spec,
+            path,
+            workers=workers,
+            threads=threads,
+            stop=stop,
+            on_progress=partial(on_stage, "mechanics"),
+            devices=devices,
+            slots=slots,
+            cluster=cluster,
+        )
         seconds["mechanics"] = time.monotonic() - began
         if not complete:
             return None

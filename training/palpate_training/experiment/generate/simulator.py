@@ -15,8 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from palpate.cluster import RayCluster
 from palpate.rigid import path_lengths
-from palpate_training.experiment.generate.workers import RayCluster
 from palpate_training.experiment.plan import PlannedManipulation, PlannedTrajectory
 
 Floats = npt.NDArray[np.float64]
@@ -273,8 +273,9 @@ class TwinSimulator(Protocol):
         on_progress: OnProgress,
         devices: tuple[str, ...] = (),
         slots: int | None = None,
+        cluster: RayCluster | None = None,
     ) -> bool:
-        """Fill a store on this host; what it holds is not run again.
+        """Fill a store; what it holds is not run again.
 
         Args:
             spec: The experiment.
@@ -286,15 +287,11 @@ class TwinSimulator(Protocol):
             devices: Devices that solve ``slots`` trajectories at once each, instead of ``workers``
                 that solve one.
             slots: None = as many as the simulator thinks best.
+            cluster: Whose machines simulate instead of this host; ``devices`` are then its.
 
         Returns:
             Whether all is there; False = stopped.
         """
-
-    def simulate_on_cluster(
-        self, spec: ExperimentSpec, store: Path, cluster: RayCluster, *, on_progress: OnProgress
-    ) -> bool:
-        """Fill a store with what the machines of a cluster simulate."""
 
     def open_store(self, path: Path) -> IndentationStore:
         """Open a store.
