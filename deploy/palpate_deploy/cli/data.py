@@ -144,7 +144,7 @@ def data_generate(
     ] = None,
     slots: Annotated[
         int | None,
-        typer.Option(min=1, help="--device: trajectories at once [default: 128], 0.25 GB each."),
+        typer.Option(min=1, help="--device: trajectories at once [default: 128], 0.35 GB each."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
