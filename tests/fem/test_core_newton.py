@@ -385,20 +385,7 @@ def test_settings_are_those_that_results_were_made_with() -> None:
 def test_what_is_not_a_number_has_not_converged(wrong: str) -> None:
     errors = {
         "residual": 0.0, "volume": 1.0, "strain_error": 0.0, "gap_error_m": 0.0,
-        "traction_error": 0.0, "touched": True,
+        "traction_error": 0.0,
     }  # fmt: skip
     assert has_converged(SimpleNamespace(**errors), 1.0, NewtonSettings())
     assert not has_converged(SimpleNamespace(**{**errors, wrong: np.nan}), 1.0, NewtonSettings())
-
-
-def test_where_nobody_touches_the_skin_less_is_left_over() -> None:
-    errors = {
-        "residual": 9e-7, "volume": 1.0, "strain_error": 0.0, "gap_error_m": 0.0,
-        "traction_error": 0.0,
-    }  # fmt: skip
-    assert has_converged(SimpleNamespace(**errors, touched=True), 1.0, NewtonSettings())
-    assert not has_converged(SimpleNamespace(**errors, touched=False), 1.0, NewtonSettings())
-    tight = NewtonSettings(tolerance=1e-9)
-    errors["residual"] = 5e-9
-    assert has_converged(SimpleNamespace(**errors, touched=False), 1.0, NewtonSettings())
-    assert not has_converged(SimpleNamespace(**errors, touched=False), 1.0, tight)

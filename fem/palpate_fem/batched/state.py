@@ -40,11 +40,6 @@ class SlotNumbers:
     fluid_pressure: float
     sets_changed: bool
 
-    @property
-    def touched(self) -> bool:
-        """Whether the indenter bears on the skin."""
-        return bool(self.net_force.any())
-
 
 @dataclass(frozen=True, slots=True)
 class Listed:

@@ -27,10 +27,6 @@ FIRST_VISCOSITY = 1.0
 VISCOSITY_FALL, VISCOSITY_RISE = 0.3, 3.0
 NO_VISCOSITY, LEAST_VISCOSITY, MOST_VISCOSITY = 3e-3, 1e-2, 100.0
 
-UNTOUCHED = 1e-8
-"""Tolerance of the unbalanced force where nobody touches the skin: there it costs an iteration or
-two, and 1e-6 would leave the skin 0.1 um from where it was before it was touched."""
-
 STALLED = 0.8
 """Residual over that two iterations before from which the iteration is taken to stall."""
 
@@ -154,10 +150,6 @@ class BalanceErrors(Protocol):
     def traction_error(self) -> float:
         """Largest error of a traction, over the largest one."""
 
-    @property
-    def touched(self) -> bool:
-        """Whether the indenter bears on the skin."""
-
 
 def largest_error(balance: BalanceErrors, volume: float | None) -> float:
     """Largest of the relative errors, weighted by their tolerances.
@@ -180,10 +172,9 @@ def largest_error(balance: BalanceErrors, volume: float | None) -> float:
 
 def has_converged(balance: BalanceErrors, volume: float | None, settings: NewtonSettings) -> bool:
     """Whether all errors are within their tolerances; see `largest_error`."""
-    tolerance = settings.tolerance if balance.touched else min(settings.tolerance, UNTOUCHED)
     # Written so that what is not a number has not converged.
     return (
-        balance.residual <= tolerance
+        balance.residual <= settings.tolerance
         and (volume is None or abs(balance.volume - volume) <= settings.volume_tolerance * volume)
         and balance.gap_error_m <= settings.gap_tolerance_m
         and balance.traction_error <= settings.traction_tolerance

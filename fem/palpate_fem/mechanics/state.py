@@ -141,11 +141,6 @@ class ForceBalance:
     smallest_jacobian: float
 
     @property
-    def touched(self) -> bool:
-        """Whether the indenter bears on the skin."""
-        return bool(self.indenter.any())
-
-    @property
     def residual(self) -> float:
         """Unbalanced force over the scale of the forces that cancel."""
         return float(np.linalg.norm(self.unbalanced)) / max(self.scale, FORCE_FLOOR_N)
