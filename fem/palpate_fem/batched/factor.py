@@ -10,7 +10,6 @@ it is. Where only contact has changed, that is most of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,24 +24,6 @@ from palpate_fem.batched.launches import Launches
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
 
 
-@dataclass(frozen=True, slots=True)
-class _Works:
-    """Pieces of work on the device, group after group.
-
-    Attributes:
-        rows: Numbers of each.
-        begins: Where each group begins, and the end of the last.
-    """
-
-    rows: wp.array
-    begins: list[int]
-
-    def of(self, group: int) -> tuple[wp.array, int, int]:
-        """All rows, the first of a group, and how many it has."""
-        first, last = self.begins[group : group + 2]
-        return self.rows, first, last - first
-
-
 class FrontTiles:
     """Where everything is in tiles; the same for every matrix.
 
@@ -52,7 +33,9 @@ class FrontTiles:
         panel_tiles: Tiles of all panels of one matrix.
         share_tiles: Tiles of all shares of one matrix.
         rows: Rows of all fronts, own and border, for one right-hand side.
-        fronts: Numbers of each front, see `columns` in the code.
+        fronts: A row for each front: own unknowns, own tiles, begin and end of its children, begin
+            of its shares, of its rows in its parent, of its rows in a vector, and of its panel,
+            and how many rows of tiles it has.
         gflop: Operations of one factorisation with the padding [GFlop].
     """
 
@@ -212,11 +195,11 @@ class BatchedFactor:
                  THREADS],
                 [self._panels, self.bad],
             )  # fmt: skip
-            works, first, number = self._products.of(level)
+            first, last = self._product_begins[level : level + 2]
             self._launch(
                 kernels.subtract_products,
-                (count, number, 2 * TILE),
-                [slots, self.marked, works, first, *sizes],
+                (count, last - first, 2 * TILE),
+                [slots, self.marked, self._products, first, *sizes],
                 both,
             )
 
@@ -348,8 +331,7 @@ class BatchedFactor:
     def _plan_factor(self) -> None:
         """Tiles of the shares, level after level."""
         tiles, products = self.tiles, []
-        levels = np.argsort(tiles.level, kind="stable")
-        for k in levels:
+        for k in np.argsort(tiles.level, kind="stable"):
             o, b = int(tiles.own_tiles[k]), int(tiles.border_tiles[k])
             first = tiles.row_tile(k, np.arange(o + b))
             row, column = np.tril_indices(b)
@@ -368,8 +350,9 @@ class BatchedFactor:
             )
             products.append(np.stack(rows, axis=1))
         found = np.concatenate(products)
-        begins = np.searchsorted(found[:, 5], np.arange(tiles.levels + 1)).tolist()
-        self._products = _Works(self._ints(found[:, :5]), begins)
+        levels = np.arange(tiles.levels + 1)
+        self._product_begins = np.searchsorted(found[:, 5], levels).tolist()
+        self._products = self._ints(found[:, :5])
 
     def _plan_solve(self) -> None:
         """Rows of the fronts, level after level, and where their solutions come from."""

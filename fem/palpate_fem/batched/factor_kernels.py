@@ -97,10 +97,7 @@ def gather_shares(
     """Set tiles to what the children's shares add up to, and ones where columns are padding.
 
     ``sharing`` lists, tile after tile, the children with rows and columns in it. A thread has one
-    column of a tile, and every `EVERY`-th row of it.
-
-    ``fronts`` has a row for each: own unknowns, own tiles, begin and end of its children, begin of
-    its shares, begin of its rows in its parent (see `FrontTiles`).
+    column of a tile, and every `EVERY`-th row of it. ``fronts`` is that of `FrontTiles`.
     """
     i, number, thread = wp.tid()
     slot = slots[i]

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from palpate_fem.batched.dense_tiles import THREADS
+
 KEPT = 2000
 """Launches that are kept: several times those of a sweep."""
 
@@ -27,16 +29,14 @@ class Launches:
         dim: Any,
         inputs: list[Any],
         outputs: list[Any],
-        threads: int = 256,
     ) -> None:
         """Run a kernel with ``dim`` threads; none = nothing happens.
 
         Args:
-            kernel: A kernel; all of its module have blocks of so many threads.
+            kernel: A kernel; all have blocks of `THREADS`, so that modules are compiled once.
             dim: Number of threads, or of each dimension.
             inputs: Its first arguments.
             outputs: The others.
-            threads: Of a block.
         """
         if not np.prod(dim):
             return
@@ -49,7 +49,7 @@ class Launches:
                 dim=dim,
                 inputs=inputs,
                 outputs=outputs,
-                block_dim=threads,
+                block_dim=THREADS,
                 device=self._device,
                 record_cmd=True,
             )

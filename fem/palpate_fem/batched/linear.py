@@ -13,16 +13,13 @@ from numpy.typing import NDArray
 
 from palpate_fem.arrays import Floats
 from palpate_fem.batched import kernels
+from palpate_fem.batched.dense_tiles import THREADS
 from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.factor import BatchedFactor
 from palpate_fem.batched.launches import Launches
 from palpate_fem.batched.state import BatchedState, Listed
 
 Flags = NDArray[np.bool_]
-
-THREADS = 256
-"""Threads of a block that adds up a stretch of a vector: as in other launches, so that the kernels
-are compiled once."""
 
 CHANGE, MORE = 0, 1
 """Lanes of the vectors: the solution, and the border or the correction."""

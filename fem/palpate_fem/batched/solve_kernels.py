@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 """Kernels that solve with the batched multifrontal factor: a block of threads for each front.
 
-A front has its own rows and those of its border in one stretch of ``work``, whose begin is the
-sixth of its numbers (``fronts``, see `FrontTiles`).
+A front has its own rows and those of its border in one stretch of ``work``; ``fronts`` is that of
+`FrontTiles`.
 """
 
 from __future__ import annotations
