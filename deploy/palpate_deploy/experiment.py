@@ -26,10 +26,11 @@ from palpate_fem.electrodes.electronics import (
     skewed,
 )
 from palpate_fem.electrodes.specimen import SpecimenParameters
-from palpate_fem.indenter.catalogue import indenter_names, make_indenter
+from palpate_fem.indenter.catalogue import BETWEEN, indenter_names, make_indenter
 from palpate_fem.indenter.path import parse_segments
 from palpate_fem.population.members import Member, read_population
 from palpate_fem.population.responses import Population, clear_steps
+from palpate_fem.random_presses import RandomPress, random_presses
 from palpate_fem.result import IndentationResult
 from palpate_fem.service.batch import (
     BatchReport,
@@ -150,12 +151,17 @@ def _build(spec: ExperimentSpec) -> BiotacTip:
     return tip
 
 
+def _indenters(spec: ExperimentSpec) -> tuple[str, ...]:
+    """Names of an experiment's indenters."""
+    named = tuple(make_indenter(name).name for name in spec.indenters)
+    return named or indenter_names() + (BETWEEN if spec.presses else ())
+
+
 def _presses(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[PlannedIndentation]:
     """All planned presses, first points first: what is there early is a fair sample."""
-    names = tuple(make_indenter(name).name for name in spec.indenters) or indenter_names()
     plans = Campaign(
         skin_of(cast("StoredFingertip", fingertip)),
-        names,
+        _indenters(spec),
         points=spec.points,
         seed=spec.seed,
         angled=spec.angled,
@@ -187,8 +193,15 @@ def _paths(
             yield PlannedManipulation(name, press.indenter, arm, first), poses
 
 
+def _random(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Iterator[RandomPress]:
+    skin = skin_of(cast("StoredFingertip", fingertip))
+    return random_presses(skin, spec.presses, seed=spec.seed, indenters=_indenters(spec))
+
+
 def _campaign(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[TrajectoryPlan]:
     """All trajectories to simulate."""
+    if spec.presses:
+        return [*_random(spec, fingertip)]
     others = [
         PlannedPath(plan.trajectory, plan.indenter, poses)
         for plan, poses in _paths(spec, fingertip)
@@ -196,10 +209,11 @@ def _campaign(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[T
     return [*_presses(spec, fingertip), *others]
 
 
+@dataclass(frozen=True)
 class FemSimulator:
-    """Skin by finite elements, electrodes by the film's conduction."""
+    """Skin by finite elements, electrodes by the film's conduction; one equals another."""
 
-    clearance_m = CLEARANCE_M
+    clearance_m: float = CLEARANCE_M
 
     def fingertip(self, spec: ExperimentSpec) -> StoredFingertip:
         """Pressurise the fingertip of an experiment, in this process."""
@@ -219,13 +233,18 @@ class FemSimulator:
                 contact_m=plan.contact_m,
                 depth_m=plan.depth_m,
             )
-            for plan in _presses(spec, fingertip)
+            for plan in ([] if spec.presses else _presses(spec, fingertip))
         ]
 
     def manipulations(
         self, spec: ExperimentSpec, fingertip: SimulatedFingertip
     ) -> Sequence[PlannedManipulation]:
-        """The other paths at each point."""
+        """The other paths at each point, or presses at random."""
+        if spec.presses:
+            return [
+                PlannedManipulation(one.name, one.indenter, assign_arm(one.target), one.direction)
+                for one in _random(spec, fingertip)
+            ]
         return [plan for plan, _ in _paths(spec, fingertip)]
 
     def simulate(
@@ -258,12 +277,18 @@ class FemSimulator:
                 device=devices[0] if devices else None,
                 slots=slots or SLOTS,
                 limit_s=LIMIT_S,
+                indenters=_indenters(spec),
             )
         elif devices:
             check_devices(devices)
             threads, packers = threads_and_packers(devices)
             batch = DeviceBatch(
-                setup, devices, slots=slots or SLOTS, threads=threads, limit_s=LIMIT_S
+                setup,
+                devices,
+                slots=slots or SLOTS,
+                threads=threads,
+                limit_s=LIMIT_S,
+                indenters=_indenters(spec),
             )
         else:
             packers = 0

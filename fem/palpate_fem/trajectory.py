@@ -128,9 +128,9 @@ def segment_path(
 ) -> Floats:
     """A path that follows segments one after the other, each in equal steps.
 
-    It begins just clear of the skin, turned to where the first segment, a press, leads. Later
-    presses do not turn the indenter. Directions are those of the target's plane, also where a slide
-    or a roll has left it: they do not follow the curved skin.
+    It begins just clear of the skin, facing where the first segment, a press, leads, and turned
+    about its axis as that says. Later presses do not turn the indenter. Directions are those of the
+    target's plane, also where a slide or a roll has left it: they do not follow the curved skin.
 
     Args:
         indenter: The indenter.
@@ -163,7 +163,14 @@ def segment_path(
             if not moves:
                 steps = _steps(depth_m, step_m)
                 path, _ = _straight_path(
-                    indenter, target, direction, surface, depth_m, steps, clearance_m
+                    indenter,
+                    target,
+                    direction,
+                    surface,
+                    depth_m,
+                    steps,
+                    clearance_m,
+                    turn_rad=segment.turn_rad,
                 )
                 moves.append(path)
             else:
@@ -418,8 +425,13 @@ def _straight_path(
     depth_m: float,
     steps: int,
     clearance_m: float,
+    *,
+    turn_rad: float = 0.0,
 ) -> tuple[Floats, float]:
-    """`press_path`, and the travel beyond the target at first contact [m]."""
+    """`press_path`, and the travel beyond the target at first contact [m].
+
+    ``turn_rad`` is how far the indenter is turned about its axis.
+    """
     if steps < 1:
         raise ConfigError(f"a path of {steps} steps", remedy="ask for at least one step")
     for what, value in (("depth_m", depth_m), ("clearance_m", clearance_m)):
@@ -430,6 +442,9 @@ def _straight_path(
         raise ConfigError(f"target {target!r} is not a point", remedy="give three finite numbers")
     direction = unit(direction)
     quaternion = facing(direction)
+    if turn_rad:
+        turned = rotation_matrices(quaternion) @ _turns((0.0, 0.0, 1.0), np.array([turn_rad]))
+        quaternion = quaternions_of(turned)[0]
     contact_m = first_contact(indenter, quaternion, target, direction, surface)
     travel = contact_m + np.concatenate([[-clearance_m], depth_m * np.arange(1, steps + 1) / steps])
     path = np.empty((steps + 1, 7))

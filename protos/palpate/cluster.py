@@ -53,7 +53,10 @@ class RayCluster(Closing):
 
     Attributes:
         ray: Ray's module, connected.
+        sees_files: Whether its workers see the files of this host.
     """
+
+    sees_files = False
 
     def __init__(self, address: str) -> None:
         """Join it.

@@ -253,6 +253,40 @@ def test_paths_that_slide_twist_and_go_back_become_rows_too(
     assert name in {mixed.trajectories[t] for t in mixed.trial_trajectory}
 
 
+def test_presses_at_random_are_executed_on_some_of_the_specimens(tmp_path: Path) -> None:
+    spec = ExperimentSpec(presses=6, units_each=1, edge_m=1.2e-3, seed=5)
+    unit = SpecimenParameters()
+    four = specimens_of(
+        Member(replace(unit, name=f"unit-{k}", sigma_s_m=0.2 + 0.1 * k), None, 0.0)
+        for k in range(4)
+    )
+    done = generate(tmp_path / "random", spec, four, FemSimulator(), workers=1)
+    assert done is not None
+    data = done.data.experiment
+    # Sizes between the paper's come after its nine, so six presses are of six of those.
+    assert len(set(data.indenters)) == len(data.trajectories) > 3
+    assert all(name.endswith("/random") for name in data.trajectories)
+    assert len(data.trial_unit) == len(data.trajectories)  # one specimen each
+    assert len(set(data.trial_unit.tolist())) > 1
+    assert done.data.mixed.contact is not None
+    again = generate(tmp_path / "random", spec, four, FemSimulator(), workers=1)
+    assert again is not None
+    np.testing.assert_array_equal(again.data.experiment.tared, data.tared)
+    every = replace(spec, units_each=0)
+    assert provenance_sha256(every, four, "") != provenance_sha256(spec, four, "")
+
+
+@pytest.mark.parametrize("extra", [("--points", "3"), ("--angled", "0"), ("--path", "press 1 mm")])
+def test_presses_at_random_have_no_points_angles_or_paths(
+    tmp_path: Path, extra: tuple[str, ...]
+) -> None:
+    words = ["generate", str(tmp_path / "no"), "--random", "3", *extra]
+    refused = CliRunner().invoke(twin_app, words)
+    assert refused.exit_code == 2
+    assert "--random has no" in refused.output
+    assert not (tmp_path / "no").exists()
+
+
 def test_another_experiment_does_not_go_into_the_same_folder(
     generated: GeneratedExperiment,
 ) -> None:

@@ -363,7 +363,7 @@ def test_frictions_unsymmetric_share_is_answered(strength: float, left: float | 
 def test_settings_are_those_that_results_were_made_with() -> None:
     settings = NewtonSettings()
     assert (settings.tolerance, settings.volume_tolerance) == (1e-6, 1e-6)
-    assert (settings.gap_tolerance_m, settings.traction_tolerance) == (1e-7, 0.01)
+    assert (settings.gap_tolerance_m, settings.traction_tolerance) == (1e-9, 0.01)
     assert (settings.iterations, settings.pseudo_transient_iterations) == (20, 40)
     assert (settings.largest_move_m, settings.keep_factor, settings.keep_elastic) == (
         0.25e-3, 0.3, 0.15,

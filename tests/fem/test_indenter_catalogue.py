@@ -82,6 +82,33 @@ def test_the_frame_is_that_of_the_convention(name: str) -> None:
     assert (signed_distance(make_indenter(name), np.zeros((1, 3)))[0] > 1e-3) == bore
 
 
+@pytest.mark.parametrize(
+    ("name", "diameter_m"),
+    [("sphere_5mm", 5e-3), ("sphere_4-5mm", 4.5e-3), ("sphere_10mm", 10e-3), ("sphere_3mm", 3e-3),
+     ("cylinder_short_5mm", 5e-3), ("cylinder_short_10mm", 10e-3), ("cylinder_short_14mm", 14e-3)],
+)  # fmt: skip
+def test_spheres_and_short_cylinders_have_any_diameter(name: str, diameter_m: float) -> None:
+    indenter, radius = make_indenter(name), 0.5 * diameter_m
+    assert indenter.name == name
+    angles = np.linspace(-1.2, 1.2, 25)
+    round_tip = np.stack([0 * angles, radius * np.sin(angles), radius * (np.cos(angles) - 1)], 1)
+    np.testing.assert_allclose(signed_distance(indenter, round_tip), 0.0, atol=1e-9)
+    beside = np.array([[3.4e-3, 0.0, -radius]])  # a cylinder is 7 mm long, a sphere is round
+    inside = name.startswith("cylinder") or radius > 3.4e-3
+    assert (signed_distance(indenter, beside)[0] < 0.0) == inside
+
+
+@pytest.mark.parametrize("name", ["sphere_2mm", "sphere_20mm", "cylinder_short_0mm"])
+def test_a_diameter_that_no_mesh_resolves_or_no_finger_takes_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match="give a diameter from 3 to 14 mm"):
+        make_indenter(name)
+
+
+def test_the_names_of_the_paper_mean_what_they_meant() -> None:
+    assert make_indenter("sphere_7mm").name == "sphere_medium"
+    assert make_indenter("cylinder_short_7mm").name == "cylinder_medium"
+
+
 def test_dimensions_are_the_published_ones() -> None:
     assert along_axis("sphere_medium", 0) == pytest.approx(np.sqrt(3.5**2 - 1.0) * 1e-3)
     assert along_axis("sphere_large", 1) == pytest.approx(np.sqrt(7.0**2 - 4.5**2) * 1e-3)

@@ -333,3 +333,23 @@ def test_steps_that_are_too_many_or_none_are_refused(step_m: float) -> None:
 def test_segments_that_make_no_path_are_refused(segments: list[PathSegment], problem: str) -> None:
     with pytest.raises(ConfigError, match=problem):
         segment_path(make_indenter("cube"), TARGET, PAD, segments, FINGER)
+
+
+def test_a_press_may_turn_the_indenter_about_its_axis_beforehand() -> None:
+    def path(words: str) -> Floats:
+        target = np.array([-7.3e-3, 0.0, -8.3e-3])
+        return segment_path(make_indenter("cube"), target, PAD, parse_segments(words), FINGER)
+
+    plain, turned = path("press 1 mm at 20 deg"), path("press 1 mm at 20 deg turned 30 deg")
+    before, after = (rotation_matrices(one[:, 3:]) for one in (plain, turned))
+    half = math.radians(30.0)
+    spin = np.array(
+        [[math.cos(half), -math.sin(half), 0], [math.sin(half), math.cos(half), 0], [0, 0, 1]]
+    )
+    np.testing.assert_allclose(after, before @ spin, atol=1e-12)
+    check_clear(make_indenter("cube"), turned[0], FINGER)
+    with pytest.raises(ConfigError, match="turns the indenter on the way"):
+        parse_segments("press 1 mm, press 1 mm turned 3 deg")
+    for wrong in ("press 1 mm turned 400 deg", "press 1 mm, unload turned 3 deg"):
+        with pytest.raises(ConfigError, match="cannot be turned so"):
+            parse_segments(wrong)

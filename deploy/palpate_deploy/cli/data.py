@@ -109,11 +109,26 @@ def _app(room: str) -> typer.Typer:
 )
 def data_generate(
     out: Annotated[Path, typer.Argument(metavar="FOLDER", help="Takes all; goes on if begun.")],
-    points: PointsOption = 10,
-    angled: AngledOption = 4,
+    points: Annotated[
+        int | None, typer.Option(min=1, help="Points for each indenter [default: 10].")
+    ] = None,
+    angled: Annotated[
+        int | None, typer.Option(min=0, max=4, help="Angled paths at each [default: 4].")
+    ] = None,
+    random: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Instead: so many presses at random points, tilted by up to 40 degrees; some "
+            "slide or twist; spheres and cylinders of sizes between the nine's, too.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of points, registration and noise.")] = 0,
     indenter: IndenterOption = None,
     units: UnitsOption = None,
+    units_each: Annotated[
+        int, typer.Option(min=0, help="Specimens that execute each trajectory; 0 = all.")
+    ] = 0,
     path: Annotated[
         list[str] | None,
         typer.Option(
@@ -148,7 +163,10 @@ def data_generate(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Press nine indenters on three simulated BioTacs; write both of the paper's data sets."""
+    """Press indenters on simulated BioTacs; write both of the paper's data sets.
+
+    As the paper does: nine indenters at ten points of three specimens. Or at random.
+    """
     from palpate_deploy.experiment import FemSimulator, read_specimens
     from palpate_fem.cli.model import workers_for
     from palpate_fem.cli.terminal import progress_bar, stop_on_signal
@@ -163,10 +181,16 @@ def data_generate(
     low, high = LIMITS["fluid_volume_m3"]
     if not low < fill_ml * 1e-6 <= high:
         raise typer.BadParameter(f"{fill_ml} ml is not within {low * 1e6:g} to {high * 1e6:g}")
+    if random and (points is not None or angled is not None or path):
+        raise typer.BadParameter("--random has no --points, --angled or --path")
     specimens = read_specimens(units)
+    if units_each > len(specimens):
+        raise typer.BadParameter(f"--units-each {units_each}: there are {len(specimens)} specimens")
     spec = ExperimentSpec(
-        points=points,
-        angled=angled,
+        points=10 if points is None else points,
+        angled=4 if angled is None else angled,
+        presses=random or 0,
+        units_each=units_each,
         seed=seed,
         edge_m=edge_mm * 1e-3,
         fluid_volume_m3=fill_ml * 1e-6,

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Callable
 from functools import cache
 
@@ -115,14 +116,12 @@ def _sphere_small() -> tuple[Primitive, ...]:
     return (_ball(radius), rod, *steps, _disc(plate, BASE_M, BASE_M + 0.05e-3, 0.025e-3))
 
 
-def _sphere_medium() -> tuple[Primitive, ...]:
-    radius = 3.5e-3
-    return _ball(radius), _disc(radius, BASE_M, -radius + _CREASE_M, _CREASE_M)
+def _sphere_on_rod(radius_m: float) -> tuple[Primitive, ...]:
+    return _ball(radius_m), _disc(radius_m, BASE_M, -radius_m + _CREASE_M, _CREASE_M)
 
 
-def _sphere_large() -> tuple[Primitive, ...]:
-    radius = 7.0e-3
-    return _ball(radius), *_circle_to_square(radius)
+def _sphere_on_shaft(radius_m: float) -> tuple[Primitive, ...]:
+    return _ball(radius_m), *_circle_to_square(radius_m)
 
 
 def _lying(radius_m: float, half_flat_m: float) -> Primitive:
@@ -193,8 +192,8 @@ def _texture() -> tuple[Primitive, ...]:
 
 _MAKERS: dict[str, Callable[[], tuple[Primitive, ...]]] = {
     "sphere_small": _sphere_small,
-    "sphere_medium": _sphere_medium,
-    "sphere_large": _sphere_large,
+    "sphere_medium": lambda: _sphere_on_rod(3.5e-3),
+    "sphere_large": lambda: _sphere_on_shaft(7.0e-3),
     "cylinder_small": lambda: _short_cylinder(1.75e-3),
     "cylinder_medium": lambda: _short_cylinder(3.5e-3),
     "cylinder_long": _cylinder_long,
@@ -203,6 +202,30 @@ _MAKERS: dict[str, Callable[[], tuple[Primitive, ...]]] = {
     "texture": _texture,
 }
 _FILLETS_M = {"texture": 0.5e-3}
+
+_SIZED = re.compile(r"(?P<kind>sphere|cylinder_short)_(?P<diameter>\d+(-\d+)?)mm")
+_DIAMETERS_MM = (3.0, 14.0)
+
+BETWEEN = ("sphere_5mm", "sphere_10mm", "cylinder_short_5mm", "cylinder_short_10mm")
+"""Sizes between the paper's, for data sets that are to hold more than nine indenters."""
+
+
+def _sized(name: str) -> tuple[Primitive, ...] | None:
+    """A sphere, or a cylinder 7 mm long, of any diameter within limits; None = no such name."""
+    found = _SIZED.fullmatch(name)
+    if found is None:
+        return None
+    diameter_mm = float(found["diameter"].replace("-", "."))
+    low, high = _DIAMETERS_MM
+    if not low <= diameter_mm <= high:
+        raise ConfigError(
+            f"an indenter {name!r} of {diameter_mm:g} mm",
+            remedy=f"give a diameter from {low:g} to {high:g} mm",
+        )
+    radius_m = 0.5e-3 * diameter_mm
+    if found["kind"] == "cylinder_short":
+        return _short_cylinder(radius_m)
+    return _sphere_on_rod(radius_m) if radius_m <= _SHAFT_M else _sphere_on_shaft(radius_m)
 
 
 def indenter_names() -> tuple[str, ...]:
@@ -215,12 +238,16 @@ def make_indenter(name: str) -> Indenter:
     """An indenter of the catalogue.
 
     Args:
-        name: One of `indenter_names`, or the public file's name, such as ``sphere_7mm``.
+        name: One of `indenter_names`, or the public file's name, such as ``sphere_7mm``. Of spheres
+            and short cylinders there are other diameters, too: ``sphere_5mm``,
+            ``cylinder_short_4-5mm``; those above 7.2 mm narrow to the paper's base.
 
     Raises:
         ConfigError: There is none of that name; the nearest is suggested.
     """
     key = ALIASES.get(name, name)
+    if (sized := _sized(key)) is not None:
+        return Indenter(key, sized)
     if key not in _MAKERS:
         known = (*_MAKERS, *ALIASES)
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)

@@ -242,6 +242,7 @@ _SEGMENT = re.compile(
     r"(?:\s+(?P<amount>\S+)\s+(?P<unit>mm|deg))?"
     r"(?:\s+at\s+(?P<angle>\S+)\s+deg)?"
     r"(?:\s+towards\s+(?P<azimuth>\S+)(?P<degrees>\s+deg)?)?"
+    r"(?:\s+turned\s+(?P<turn>\S+)\s+deg)?"
 )
 _USE = 'write like "press 2 mm, slide 1.5 mm towards distal, twist 20 deg, roll 10 deg towards '
 _USE += '90 deg, unload"'
@@ -257,18 +258,22 @@ class PathSegment:
         angle_rad: Of a press: its angle to the inward normal.
         azimuth_rad: Along the skin, where a slide, a roll or a press at an angle leads: 0 distal,
             a quarter turn towards +y.
+        turn_rad: How far the indenter is turned about its own axis before the path begins; the
+            first segment says it.
     """
 
     kind: str
     amount: float | None = None
     angle_rad: float = 0.0
     azimuth_rad: float = 0.0
+    turn_rad: float = 0.0
 
 
 def parse_segments(text: str) -> tuple[PathSegment, ...]:
     """Segments of a path from words, such as ``press 2 mm, slide 1 mm towards +y, unload``.
 
-    * ``press D mm [at A deg [towards B]]``: D mm further in; the first counts from first contact.
+    * ``press D mm [at A deg [towards B]] [turned T deg]``: D mm further in; the first counts from
+      first contact, and only it may turn the indenter about its axis beforehand, as ``twist`` does.
     * ``slide D mm towards B``: along the plane that touches the skin at the target.
     * ``twist A deg``: about the indenter's axis, right-handed about the direction in which it
       presses.
@@ -290,6 +295,11 @@ def parse_segments(text: str) -> tuple[PathSegment, ...]:
         raise ConfigError(
             f"the path begins with {parts[0]!r}, clear of the skin", remedy="press first"
         )
+    for part, segment in zip(parts[1:], segments[1:], strict=True):
+        if segment.turn_rad:
+            raise ConfigError(
+                f"{part!r} turns the indenter on the way", remedy="turn the first press, or twist"
+            )
     return segments
 
 
@@ -324,6 +334,9 @@ def _segment(words: str) -> PathSegment:
         raise ConfigError(
             f"{words!r}: {angle:g} deg does not lead into the skin", remedy="give 0 to 89"
         )
+    turn = 0.0 if found["turn"] is None else math.radians(_finite(found["turn"], words))
+    if found["turn"] is not None and (kind != "press" or abs(turn) > LARGEST_RAD):
+        raise ConfigError(f"{words!r} cannot be turned so", remedy="turn a press, by up to 360 deg")
     amount = None
     if found["amount"] is not None:
         amount = _finite(found["amount"], words)
@@ -334,7 +347,7 @@ def _segment(words: str) -> PathSegment:
                 f"{words!r}: {found['amount']} {found['unit']} is no such way",
                 remedy="give up to 360 deg, not 0" if turns else "give more than 0 and up to 20 mm",
             )
-    return PathSegment(kind, amount, math.radians(angle), math.radians(azimuth))
+    return PathSegment(kind, amount, math.radians(angle), math.radians(azimuth), turn)
 
 
 def _finite(word: str, words: str) -> float:
@@ -360,5 +373,7 @@ def show_segments(segments: Sequence[PathSegment]) -> str:
             words += f" at {math.degrees(one.angle_rad):.6g} deg"
         if one.kind in ("slide", "roll") or one.angle_rad:
             words += f" towards {math.degrees(one.azimuth_rad):.6g} deg"
+        if one.turn_rad:
+            words += f" turned {math.degrees(one.turn_rad):.6g} deg"
         shown.append(words)
     return ", ".join(shown)

@@ -57,7 +57,7 @@ class NewtonSettings:
 
     tolerance: float = 1e-6
     volume_tolerance: float = 1e-6
-    gap_tolerance_m: float = 0.1e-6
+    gap_tolerance_m: float = 1e-9
     traction_tolerance: float = 0.01
     iterations: int = 20
     patience: int = 10

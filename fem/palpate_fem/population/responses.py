@@ -8,7 +8,7 @@ film separately.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -98,13 +98,24 @@ class Population:
             return finder.measure(self._nodes)
         return finder.of_step(self._nodes, step)
 
-    def counts(self, steps: Iterable[IndentationStep]) -> dict[str, Floats]:
-        """Ideal counts of each specimen at the steps of a trajectory, each of shape (S, 19)."""
-        found: dict[str, list[Floats]] = {name: [] for name in self.electrodes}
+    def counts(
+        self, steps: Iterable[IndentationStep], names: Collection[str] | None = None
+    ) -> dict[str, Floats]:
+        """Ideal counts of specimens at the steps of a trajectory, each of shape (S, 19).
+
+        Args:
+            steps: The steps.
+            names: Of the specimens; None = all.
+        """
+        wanted = self.electrodes.keys() if names is None else names
+        found: dict[str, list[Floats]] = {name: [] for name in self.electrodes if name in wanted}
         for step in steps:
-            for names in self._groups:
-                gap = self.gap(names[0], step)
-                for name in names:
+            for group in self._groups:
+                some = [name for name in group if name in found]
+                if not some:
+                    continue
+                gap = self.gap(some[0], step)
+                for name in some:
                     found[name].append(self.electrodes[name].of_gap(gap).counts)
         return {name: np.array(rows).reshape(-1, 19) for name, rows in found.items()}
 

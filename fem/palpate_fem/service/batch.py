@@ -25,6 +25,7 @@ from palpate_fem.calibration.runs import PlannedPath, SimulatedRun
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import check_path
+from palpate_fem.random_presses import RandomPress
 from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.jobs import (
     JobEnded,
@@ -48,7 +49,7 @@ FAILED = "failed"
 """Outcome, in a report, of a trajectory that could not be run or whose worker died."""
 
 
-TrajectoryPlan = PlannedPath | PlannedIndentation
+TrajectoryPlan = PlannedPath | PlannedIndentation | RandomPress
 """One trajectory to run."""
 
 

@@ -370,6 +370,7 @@ class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
         limit_s: Longest time for a trajectory that has to be computed on the CPU [s].
         hang_s: A process that should be at work and is silent for so long is ended [s].
         start_s: The same before its device is ready [s].
+        indenters: Names of all that trajectories may have.
 
     Raises:
         ConfigError: There are no devices or no slots.
@@ -385,6 +386,7 @@ class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
         limit_s: float = math.inf,
         hang_s: float = HANG_S,
         start_s: float = START_S,
+        indenters: tuple[str, ...] = indenter_names(),
     ) -> None:
         if not devices:
             raise ConfigError("no devices", remedy="give one or more")
@@ -396,6 +398,7 @@ class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
         self.ahead = SLOTFULS * slots * len(devices) + ON_CPU_MOST
         self._setup, self._threads = setup, threads
         self._hang_s, self._start_s = hang_s, start_s
+        self._indenters = indenters
         self._again = False  # whether the last one was started once more
         for device in devices:
             self._start(device)
@@ -406,7 +409,7 @@ class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
         return [process.pid for process in self._devices]
 
     def _start(self, device: str) -> None:
-        setup = DeviceSetup(self._setup, device, self._slots, indenter_names())
+        setup = DeviceSetup(self._setup, device, self._slots, self._indenters)
         self._devices.append(
             DeviceProcess(
                 setup,

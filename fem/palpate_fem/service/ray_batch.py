@@ -192,6 +192,7 @@ class RayBatch(SlottedBatch[RayDevice]):
         silent_s: A device's machine that does not answer for so long counts as lost [s].
         wait_s: Longest time without any machine [s].
         look_s: Time between two looks for machines [s].
+        indenters: Names of all that trajectories may have.
 
     Raises:
         ConfigError: The cluster has no GPUs, or there are no slots.
@@ -210,13 +211,12 @@ class RayBatch(SlottedBatch[RayDevice]):
         silent_s: float = HANG_S,
         wait_s: float = WAIT_S,
         look_s: float = LOOK_S,
+        indenters: tuple[str, ...] = indenter_names(),
     ) -> None:
         self._share = RayShare(cluster, setup, limit_s)
         super().__init__(slots, self._share)
         self._cluster, self._device = cluster, device
-        self._setup = DeviceSetup(
-            setup, "cuda:0" if device == "cuda" else "cpu", slots, indenter_names()
-        )
+        self._setup = DeviceSetup(setup, "cuda:0" if device == "cuda" else "cpu", slots, indenters)
         self._hang_s, self._start_s = hang_s, start_s
         self._silent_s, self._wait_s, self._look_s = silent_s, wait_s, look_s
         self._has_devices = device is not None

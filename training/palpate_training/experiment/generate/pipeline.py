@@ -156,7 +156,9 @@ def generate(
     began = time.monotonic()
     digest = provenance_sha256(spec, specimens, store.fingertip().key)
     provenance = Provenance(
-        source=f"twin: {spec.points} points x {1 + spec.angled + len(spec.paths)} trajectories an "
+        source=f"twin: {spec.presses} presses at random"
+        if spec.presses
+        else f"twin: {spec.points} points x {1 + spec.angled + len(spec.paths)} trajectories an "
         "indenter",
         command=command,
         input_sha256=digest,

@@ -53,6 +53,8 @@ class ExperimentSpec:
         indenters: Names; empty = all nine.
         paths: Further paths at each point, in words of segments (``palpate fem run --path``), whose
             direction and length are as written: no overtravel.
+        presses: Presses at random instead of points, angles and paths; 0 = none.
+        units_each: Specimens that execute each trajectory, drawn by its name; 0 = all.
     """
 
     points: int = 10
@@ -63,12 +65,15 @@ class ExperimentSpec:
     overtravel_m: float = OVERTRAVEL_M
     indenters: tuple[str, ...] = ()
     paths: tuple[str, ...] = ()
+    presses: int = 0
+    units_each: int = 0
 
     def content(self) -> dict[str, Any]:
-        """As plain values; without paths as they were before there were any."""
+        """As plain values; those that came later only where they are used."""
         values = asdict(self)
-        if not self.paths:
-            del values["paths"]
+        for key in ("paths", "presses", "units_each"):
+            if not values[key]:
+                del values[key]
         return values
 
 
@@ -235,8 +240,10 @@ class PressedSpecimens(Protocol):
     rest_counts: Mapping[str, Floats]
     """Ideal counts of each untouched specimen, by name, shape (19,)."""
 
-    def counts(self, steps: Sequence[SimulatedStep]) -> Mapping[str, Floats]:
-        """Ideal counts of each specimen at each step, by name, shape (S, 19)."""
+    def counts(
+        self, steps: Sequence[SimulatedStep], names: Collection[str]
+    ) -> Mapping[str, Floats]:
+        """Ideal counts of the named specimens at each step, by name, shape (S, 19)."""
 
 
 MakeSpecimens = Callable[[], PressedSpecimens]
@@ -244,10 +251,16 @@ MakeSpecimens = Callable[[], PressedSpecimens]
 
 
 class TwinSimulator(Protocol):
-    """Finite elements and film electrodes, as the experiment uses them."""
+    """Finite elements and film electrodes, as the experiment uses them; can be pickled.
 
-    clearance_m: float
-    """How far from the skin the path of a simulated trajectory starts [m]."""
+    Hashable, and equal to what does the same: workers know by it what they have opened already.
+    """
+
+    @property
+    def clearance_m(self) -> float:
+        """How far from the skin the path of a simulated trajectory starts [m]."""
+
+    def __hash__(self) -> int: ...
 
     def fingertip(self, spec: ExperimentSpec) -> SimulatedFingertip:
         """Pressurise the fingertip of an experiment, in this process."""
@@ -260,7 +273,7 @@ class TwinSimulator(Protocol):
     def manipulations(
         self, spec: ExperimentSpec, fingertip: SimulatedFingertip
     ) -> Sequence[PlannedManipulation]:
-        """Its other paths, likewise."""
+        """Its other paths, or presses at random, likewise."""
 
     def simulate(
         self,

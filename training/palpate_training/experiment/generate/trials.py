@@ -30,6 +30,7 @@ from palpate_training.experiment.generate.simulator import (
     MakeSpecimens,
     OnProgress,
     PressedSpecimens,
+    SimulatedFingertip,
     SimulatedStep,
     SimulatedTrajectory,
     Specimen,
@@ -91,7 +92,7 @@ def make_trials(
         return True
     make = simulator.make_specimens(fingertip, specimens)
     work: Callable[[TrialTask], bytes] = partial(_work, make)
-    tasks = _tasks(spec, store, specimens, left, simulator)
+    tasks = _tasks(spec, store, specimens, left, simulator, in_worker=runner.sees_files)
     for task, data in runner.run(work, tasks):
         with written_whole(file_of(folder, task.name)) as part:
             part.write_bytes(data)
@@ -142,6 +143,41 @@ def registration_errors(specimens: Sequence[Specimen], seed: int) -> dict[str, F
 
 
 @dataclass(frozen=True, slots=True)
+class ClearTrajectory:
+    """A simulated trajectory.
+
+    Attributes:
+        trajectory: The simulation.
+        clear_steps: Its steps before the indenter bears on what holds the finger.
+    """
+
+    trajectory: SimulatedTrajectory
+    clear_steps: int
+
+
+@lru_cache(maxsize=1)
+def _opened(simulator: TwinSimulator, path: Path) -> tuple[IndentationStore, SimulatedFingertip]:
+    store = simulator.open_store(path)
+    return store, store.fingertip()
+
+
+def read_clear(simulator: TwinSimulator, path: Path, name: str) -> ClearTrajectory:
+    """Read a trajectory from a store, which stays open for the next one.
+
+    Raises:
+        DatasetError: It is damaged.
+    """
+    store, fingertip = _opened(simulator, path)
+    trajectory = store.trajectory(name)
+    return ClearTrajectory(trajectory, simulator.clear_steps(trajectory, fingertip))
+
+
+def _given(trajectory: ClearTrajectory) -> ClearTrajectory:
+    """For a worker on a machine that does not see the store."""
+    return trajectory
+
+
+@dataclass(frozen=True, slots=True)
 class TrialTask:
     """A simulated trajectory to be executed on the specimens.
 
@@ -152,9 +188,9 @@ class TrialTask:
         planned_m: Planned travel past first contact [m]; None = all of a path that is no press.
             Such a path is felt its way to the skin, so that a registration error does not change
             how deep it is.
-        trajectory: The simulation.
-        clear_steps: Its steps before the indenter bears on what holds the finger.
+        simulated: Gives the simulation.
         specimens: Those that execute it.
+        measured: Names of those whose ideal counts are kept.
         errors_m: Registration error of that arm for each of them [m], shape (U, 3).
         clearance_m: How far from the skin its path starts [m].
         seed: Of the experiment.
@@ -164,9 +200,9 @@ class TrialTask:
     arm: str
     direction: Floats
     planned_m: float | None
-    trajectory: SimulatedTrajectory
-    clear_steps: int
+    simulated: Callable[[], ClearTrajectory]
     specimens: tuple[Specimen, ...]
+    measured: tuple[str, ...]
     errors_m: Floats
     clearance_m: float
     seed: int
@@ -182,7 +218,7 @@ class TrialsDone:
         dropped: Specimen and reason of each that gave none.
         counts: Ideal counts of each specimen's electrodes along the simulation, untouched first,
             shape (S + 1, 19) each, whether it executed the trajectory or not: what a virtual finger
-            plays.
+            plays. Where a few of many specimens execute it, of those.
         believed: Steps S of the simulation that were used.
     """
 
@@ -195,16 +231,17 @@ class TrialsDone:
 
 def execute(pressed: PressedSpecimens, task: TrialTask) -> TrialsDone:
     """Perform and process the trials of one trajectory."""
-    steps = task.trajectory.steps[: task.clear_steps]
-    answers = pressed.counts(steps)
+    found = task.simulated()
+    trajectory, steps = found.trajectory, found.trajectory.steps[: found.clear_steps]
+    answers = pressed.counts(steps, task.measured)
     counts = {
-        name: np.concatenate([rest[None], answers[name]])
-        for name, rest in pressed.rest_counts.items()
+        name: np.concatenate([pressed.rest_counts[name][None], answers[name]])
+        for name in task.measured
     }
     kept, dropped = [], []
     for specimen, error in zip(task.specimens, task.errors_m, strict=True):
         try:
-            kept.append(_perform(task, steps, specimen, error, counts[specimen.name]))
+            kept.append(_perform(task, trajectory, steps, specimen, error, counts[specimen.name]))
         except DatasetError as failure:
             dropped.append((specimen.name, str(failure)))
     return TrialsDone(task.name, tuple(kept), tuple(dropped), counts, len(steps))
@@ -212,6 +249,7 @@ def execute(pressed: PressedSpecimens, task: TrialTask) -> TrialsDone:
 
 def _perform(
     task: TrialTask,
+    trajectory: SimulatedTrajectory,
     steps: Sequence[SimulatedStep],
     specimen: Specimen,
     error: Floats,
@@ -223,9 +261,9 @@ def _perform(
             f"{specimen.name} {task.name}: no step before it diverges or meets the mount",
             remedy="nothing to do: the trial is left out, as in the paper",
         )
-    start = task.trajectory.path[0, :3]
+    start = trajectory.path[0, :3]
     poses = np.array([step.pose[:3] for step in steps])
-    travel = travelled(task.trajectory, steps) - task.clearance_m
+    travel = travelled(trajectory, steps) - task.clearance_m
     tip = np.concatenate([start[None] + task.clearance_m * task.direction, poses])
     force = np.concatenate([np.zeros((1, 3)), [step.force for step in steps]])
     if task.planned_m is None:
@@ -246,7 +284,7 @@ def _perform(
         return stream(ideal, time_s, elapsed, drift)
 
     raw = perform(
-        TrialHeader(specimen.name, task.name, task.trajectory.indenter, task.arm),
+        TrialHeader(specimen.name, task.name, trajectory.indenter, task.arm),
         travel_m=np.concatenate([[0.0], travel]),
         force=force,
         counts=counts,
@@ -304,14 +342,18 @@ def _tasks(
     specimens: Sequence[Specimen],
     plans: Sequence[PlannedTrajectory | PlannedManipulation],
     simulator: TwinSimulator,
+    *,
+    in_worker: bool,
 ) -> Iterator[TrialTask]:
-    fingertip = store.fingertip()
     errors = registration_errors(specimens, spec.seed)
     for plan in plans:
         who = [i for i, one in enumerate(specimens) if one.pressed_with(plan.indenter)]
+        if 0 < spec.units_each < len(who):
+            draw = np.random.default_rng([spec.seed, zlib.crc32(plan.trajectory.encode())])
+            who = sorted(draw.choice(who, spec.units_each, replace=False).tolist())
         if not who:
             continue
-        trajectory = store.trajectory(plan.trajectory)
+        read = partial(read_clear, simulator, store.path, plan.trajectory)
         yield TrialTask(
             name=plan.trajectory,
             arm=plan.arm,
@@ -319,9 +361,11 @@ def _tasks(
             planned_m=plan.depth_m - spec.overtravel_m
             if isinstance(plan, PlannedTrajectory)
             else None,
-            trajectory=trajectory,
-            clear_steps=simulator.clear_steps(trajectory, fingertip),
+            simulated=read if in_worker else partial(_given, read()),
             specimens=tuple(specimens[i] for i in who),
+            measured=tuple(
+                specimens[i].name for i in (who if spec.units_each else range(len(specimens)))
+            ),
             errors_m=errors[plan.arm][np.array(who)],
             clearance_m=simulator.clearance_m,
             seed=spec.seed,

@@ -18,7 +18,13 @@ Answer = TypeVar("Answer")
 
 
 class TaskRunner(Protocol):
-    """Runs tasks somewhere."""
+    """Runs tasks somewhere.
+
+    Attributes:
+        sees_files: Whether its workers see the files of this host.
+    """
+
+    sees_files: bool
 
     def run(
         self, function: Callable[[Task], Answer], tasks: Iterable[Task]
@@ -43,6 +49,8 @@ def end_with_parent() -> None:
 
 class WorkerProcesses:
     """Worker processes of this host."""
+
+    sees_files = True
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
