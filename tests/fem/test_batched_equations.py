@@ -224,7 +224,7 @@ def test_vectors_of_the_linear_system(batch: Batch) -> None:
     np.testing.assert_array_equal(batch.vectors.numpy()[:, 0], found["right"])
     for slot, case in zip(PLACES, batch.cases, strict=True):
         for name in ("right", "border", "coupled"):
-            same(found[name][slot], case.vectors[name])
+            same(found[name][slot], case.vectors[name], 1e-11)
         largest = max(np.abs(case.vectors[name]).max() for name in ("coupled", "product"))
         apart = np.abs(found["product"][slot] - case.vectors["product"])
         assert apart.max() < ROUNDING * largest

@@ -1,5 +1,8 @@
 # mypy: ignore-errors
-"""Dense fronts in tiles of 32 x 32: factorise, substitute, multiply; CUDA and C++ (ADR 0026).
+"""Dense fronts in tiles of 32 x 32: gather, factorise, multiply; CUDA and C++ (ADR 0026).
+
+What a front takes from its children's shares, and from the matrix, it gathers where it needs it:
+sums begin with that, products are subtracted, and a tile is written once.
 
 Double precision. On a GPU from compute capability 8.0 on a warp of threads works on a tile with the
 tensor cores and loads what they take from memory straight into registers: `warp.tile_matmul` goes
@@ -25,7 +28,7 @@ LANES = 2
 THREADS = 256
 """Threads of a block, which share a front."""
 
-_TENSOR_CORES = """
+TENSOR_CORES = """
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
 #define PALPATE_TENSOR_CORES
     // Rows g (upper) and g + 8 (lower) of C += A B.
@@ -50,8 +53,26 @@ _TENSOR_CORES = """
 #endif
 """
 
+_CHILDREN = """
+    // Where a front's rows are in the border of its child k; the first tile of that one's share.
+    auto rows_in = [=](int k) { return rows_in_child.data + children.data[3 * k]; };
+    auto share_of = [=](int k) {
+        return shares.data + (size_t(first_share) + children.data[3 * k + 1]) * 1024;
+    };
+    // An entry of a share, a lower triangle. Where there is none, the first one is read in vain:
+    // with a branch a thread would wait for each entry before it asks for the next.
+    auto entry_of = [](const double* share, int a, int b) {
+        const bool inside = a >= (b & 0x7fffffff);  // -1 becomes the largest number
+        const int row = (((a >> 5) * ((a >> 5) + 1)) >> 1) * 1024 + (a & 31) * 32;
+        const int column = (b >> 5) * 1024 + (b & 31);
+        const double value = share[inside ? row + column : 0];
+        return inside ? value : 0.0;
+    };
+"""
+
 _PRODUCTS = (
-    _TENSOR_CORES
+    TENSOR_CORES
+    + _CHILDREN
     + """
 #ifdef PALPATE_TENSOR_CORES
     const int row = lane / 4, column = 2 * (lane % 4);
@@ -67,21 +88,109 @@ _PRODUCTS = (
                 add_product(sum[0][n], sum[1][n], upper, lower, pair_at(b + 256 * n));
         }
     };
-    // Half of: target = target - sum over i of a_i times transposed b_i
-    auto subtract = [=](double* target, const double* a, const double* b, int count, int half) {
-        double sum[2][4][2] = {};
+    auto int_pair_at = [](const int* p) { return *reinterpret_cast<const int2*>(p); };
+    // Half of what the children's shares add up to in tile (r, c), negative.
+    auto gather = [=](double (&sum)[2][4][2], int r, int c, int half) {
+        for (int k = child; k < last_child; ++k) {
+            const int* rows_there = rows_in(k);
+            const int* a = rows_there + 32 * r + 16 * half + row;
+            const int* b = rows_there + 32 * c + column;
+            const double* share = share_of(k);
+            const int upper = a[0], lower = a[8];
+            #pragma unroll
+            for (int n = 0; n < 4; ++n) {
+                const int2 at = int_pair_at(b + 8 * n);
+                sum[0][n][0] -= entry_of(share, upper, at.x);
+                sum[0][n][1] -= entry_of(share, upper, at.y);
+                sum[1][n][0] -= entry_of(share, lower, at.x);
+                sum[1][n][1] -= entry_of(share, lower, at.y);
+            }
+        }
+    };
+    // Half of: target = - sum - sum over i of a_i times transposed b_i
+    auto subtract = [=](double (&sum)[2][4][2], double* target, const double* a, const double* b,
+                        int count, int half) {
+        __syncwarp();  // threads that gathered meet again
         for (int i = 0; i < count; ++i)
             add_tiles(sum, a + 1024 * i + 512 * half, b + 1024 * i);
         #pragma unroll
         for (int m = 0; m < 2; ++m)
             #pragma unroll
-            for (int n = 0; n < 4; ++n) {
-                double* at = target + 512 * half + (8 * m + row) * 32 + 8 * n + column;
-                const double2 value = pair_at(at);
-                *reinterpret_cast<double2*>(at)
-                    = make_double2(value.x - sum[m][n][0], value.y - sum[m][n][1]);
+            for (int n = 0; n < 4; ++n)
+                *reinterpret_cast<double2*>(
+                    target + 512 * half + (8 * m + row) * 32 + 8 * n + column)
+                    = make_double2(-sum[m][n][0], -sum[m][n][1]);
+    };
+#else
+    // What the children's shares add up to at row i and column j of tile (r, c).
+    auto gathered = [=](int r, int c, int i, int j) {
+        double sum = 0.0;
+        for (int k = child; k < last_child; ++k)
+            sum += entry_of(share_of(k), rows_in(k)[32 * r + i], rows_in(k)[32 * c + j]);
+        return sum;
+    };
+    // Target = begin - sum over n of a_n times transposed b_n
+    auto subtract = [](double* target, const double* a, const double* b, int count, auto begin) {
+        for (int i = 0; i < 32; ++i)
+            for (int j = 0; j < 32; ++j) {
+                double sum = begin(i, j);
+                for (int n = 0; n < count; ++n)
+                    for (int k = 0; k < 32; ++k)
+                        sum -= a[1024 * n + 32 * i + k] * b[1024 * n + 32 * j + k];
+                target[32 * i + j] = sum;
             }
     };
+#endif
+"""
+)
+
+_SUBTRACT_PRODUCT = (
+    """
+    const int lane = thread % 32;
+"""
+    + _PRODUCTS
+    + """
+    double* target = shares.data + size_t(tile) * 1024;
+    const double* a = panels.data + size_t(left) * 1024;
+    const double* b = panels.data + size_t(right) * 1024;
+#ifdef PALPATE_TENSOR_CORES
+    double sum[2][4][2] = {};
+    gather(sum, r, c, thread / 32);
+    subtract(sum, target, a, b, count, thread / 32);
+#else
+    if (thread == 0)
+        subtract(target, a, b, count, [=](int i, int j) { return gathered(r, c, i, j); });
+#endif
+"""
+)
+
+FRONT = """
+    double* tiles = panels.data + size_t(panel) * 1024;
+    // First tile of a row of tiles; below the triangle all rows are equally long.
+    auto above = [=](int r) {
+        return r < own ? r * (r + 1) / 2 : own * (own + 1) / 2 + (r - own) * own;
+    };
+    auto tiles_of = [=](int r) { return tiles + size_t(above(r)) * 1024; };
+"""
+
+_FACTORISE = (
+    """
+    const int lane = thread % 32;
+"""
+    + _PRODUCTS
+    + FRONT
+    + """
+    // Which of the matrix's entries stand in a tile, if any do: -1 = none, -2 = a one.
+    const double* known = &wp::index(values, slot, 0);
+    auto sources_of = [=](int r, int c) {
+        const int at = sources_at.data[first_tile + above(r) + c];
+        return at < 0 ? nullptr : sources.data + size_t(at) * 1024;
+    };
+    auto value_of = [=](int source) {
+        const double value = known[source < 0 ? 0 : source];
+        return source >= 0 ? value : source == -2 ? 1.0 : 0.0;
+    };
+#ifdef PALPATE_TENSOR_CORES
     // Half of: target = target times transposed b
     auto multiply = [=](double* target, const double* b, int half) {
         double sum[2][4][2] = {};
@@ -95,66 +204,32 @@ _PRODUCTS = (
                     target + 512 * half + (8 * m + row) * 32 + 8 * n + column)
                     = make_double2(sum[m][n][0], sum[m][n][1]);
     };
-#else
-    auto subtract = [](double* target, const double* a, const double* b, int count) {
-        for (int i = 0; i < 32; ++i)
-            for (int j = 0; j < 32; ++j) {
-                double sum = 0.0;
-                for (int n = 0; n < count; ++n)
-                    for (int k = 0; k < 32; ++k)
-                        sum += a[1024 * n + 32 * i + k] * b[1024 * n + 32 * j + k];
-                target[32 * i + j] -= sum;
+    auto add_entries = [=](double (&sum)[2][4][2], int r, int c, int half) {
+        const int* from = sources_of(r, c);
+        if (from == nullptr)
+            return;
+        #pragma unroll
+        for (int m = 0; m < 2; ++m)
+            #pragma unroll
+            for (int n = 0; n < 4; ++n) {
+                const int2 source
+                    = int_pair_at(from + 512 * half + (8 * m + row) * 32 + 8 * n + column);
+                sum[m][n][0] -= value_of(source.x);
+                sum[m][n][1] -= value_of(source.y);
             }
     };
-#endif
-"""
-)
-
-_SUBTRACT_PRODUCT = (
-    """
-    const int lane = thread % 32;
-"""
-    + _PRODUCTS
-    + """
-    double* target = out.data + size_t(tile) * 1024;
-    const double* a = panels.data + size_t(left) * 1024;
-    const double* b = panels.data + size_t(right) * 1024;
-#ifdef PALPATE_TENSOR_CORES
-    subtract(target, a, b, count, thread / 32);
-#else
-    if (thread == 0)
-        subtract(target, a, b, count);
-#endif
-"""
-)
-
-_FRONT = """
-    double* tiles = panels.data + size_t(panel) * 1024;
-    // First tile of a row of tiles; below the triangle all rows are equally long.
-    auto tiles_of = [=](int r) {
-        const int above = r < own ? r * (r + 1) / 2 : own * (own + 1) / 2 + (r - own) * own;
-        return tiles + size_t(above) * 1024;
-    };
-"""
-
-_FACTORISE = (
-    """
-    const int lane = thread % 32;
-"""
-    + _PRODUCTS
-    + _FRONT
-    + """
-#ifdef PALPATE_TENSOR_CORES
     __shared__ double exchange[2][2][32];
     const int warp = thread / 32, warps = threads / 32;  // eight
     bool all_good = true;
     for (int c = 0; c < own; ++c) {
         double* diagonal = tiles_of(c) + 1024 * c;
-        if (c > 0)
-            for (int half = 2 * c + warp; half < 2 * rows; half += warps) {
-                double* first = tiles_of(half / 2);
-                subtract(first + 1024 * c, first, tiles_of(c), c, half % 2);
-            }
+        for (int half = 2 * c + warp; half < 2 * rows; half += warps) {
+            double* first = tiles_of(half / 2);
+            double sum[2][4][2] = {};
+            gather(sum, half / 2, c, half % 2);
+            add_entries(sum, half / 2, c, half % 2);
+            subtract(sum, first + 1024 * c, first, tiles_of(c), c, half % 2);
+        }
         __syncthreads();
         // Every thread has four numbers of a row. Up to column k they are the inverse factor's,
         // which needs no room before; beyond, what elimination has left of the matrix.
@@ -212,8 +287,12 @@ _FACTORISE = (
         double* diagonal = tiles_of(c) + 1024 * c;
         double factor[1024] = {}, inverse[1024] = {};
         bool good = true;
-        for (int r = c; r < rows && c > 0; ++r)
-            subtract(tiles_of(r) + 1024 * c, tiles_of(r), tiles_of(c), c);
+        for (int r = c; r < rows; ++r) {
+            const int* from = sources_of(r, c);
+            subtract(tiles_of(r) + 1024 * c, tiles_of(r), tiles_of(c), c, [=](int i, int j) {
+                return gathered(r, c, i, j) + (from ? value_of(from[32 * i + j]) : 0.0);
+            });
+        }
         for (int j = 0; j < 32; ++j)
             for (int i = j; i < 32; ++i) {
                 double sum = diagonal[32 * i + j];
@@ -250,223 +329,61 @@ _FACTORISE = (
 """
 )
 
-_VECTORS = (
-    _TENSOR_CORES
-    + _FRONT
-    + """
-    double* x = work.data + size_t(begin) * 2;
-#ifdef PALPATE_TENSOR_CORES
-    const int lane = thread % 32, warp = thread / 32, warps = threads / 32;
-    const int row = lane / 4, column = 2 * (lane % 4);
-    // The threads of columns 0 and 1 of B hold 32 rows of two numbers, the others zeros.
-    auto number = [=](const double* known, int k) { return row < 2 ? known[2 * k + row] : 0.0; };
-    // Add a tile times them: row 8 m + g at the threads with s = 0.
-    auto add_tile = [=](double (&sum)[4][2], const double* tile, const double* known) {
-        #pragma unroll
-        for (int k = 0; k < 32; k += 8) {
-            const double2 factor
-                = make_double2(number(known, k + column), number(known, k + column + 1));
-            #pragma unroll
-            for (int m = 0; m < 4; m += 2) {
-                const double* at = tile + (8 * m + row) * 32 + k + column;
-                add_product(sum[m], sum[m + 1], pair_at(at), pair_at(at + 256), factor);
-            }
-        }
-    };
-    // Add a transposed tile times them: row 16 (m / 2) + 2 g + m % 2.
-    auto add_transposed = [=](double (&sum)[4][2], const double* tile, const double* known) {
-        #pragma unroll
-        for (int i = 0; i < 32; i += 8) {
-            const int k = i + lane % 4;
-            const double2 factor = make_double2(number(known, k), number(known, k + 4));
-            #pragma unroll
-            for (int m = 0; m < 4; m += 2) {
-                const double2 one = pair_at(tile + k * 32 + 8 * m + 2 * row);
-                const double2 other = pair_at(tile + (k + 4) * 32 + 8 * m + 2 * row);
-                add_product(
-                    sum[m], sum[m + 1], make_double2(one.x, other.x), make_double2(one.y, other.y),
-                    factor);
-            }
-        }
-    };
-#else
-    if (thread != 0)
-        return;
-#endif
-"""
-)
-
-_SUBSTITUTE_FORWARD = (
-    _VECTORS
-    + """
-#ifdef PALPATE_TENSOR_CORES
-    for (int c = 0; c < own; ++c) {
-        double* known = x + 64 * c;
-        if (warp == 0) {
-            double sum[4][2] = {};
-            add_tile(sum, tiles_of(c) + 1024 * c, known);
-            __syncwarp();  // all have read what is overwritten now
-            if (column == 0)
-                for (int m = 0; m < 4; ++m)
-                    for (int n = 0; n < 2; ++n)
-                        known[2 * (8 * m + row) + n] = sum[m][n];
-        }
-        __syncthreads();
-        for (int r = c + 1 + warp; r < rows; r += warps) {
-            double sum[4][2] = {};
-            add_tile(sum, tiles_of(r) + 1024 * c, known);
-            if (column == 0)
-                for (int m = 0; m < 4; ++m)
-                    for (int n = 0; n < 2; ++n)
-                        x[64 * r + 2 * (8 * m + row) + n] -= sum[m][n];
-        }
-        __syncthreads();
-    }
-#else
-    for (int c = 0; c < own; ++c) {
-        double known[64];
-        for (int r = c; r < rows; ++r) {
-            const double* tile = tiles_of(r) + 1024 * c;
-            const double* from = r == c ? x + 64 * c : known;
-            double sum[64] = {};
-            for (int i = 0; i < 32; ++i)
-                for (int k = 0; k < 32; ++k)
-                    for (int n = 0; n < 2; ++n)
-                        sum[2 * i + n] += tile[32 * i + k] * from[2 * k + n];
-            for (int i = 0; i < 64; ++i)
-                if (r == c)
-                    known[i] = sum[i];
-                else
-                    x[64 * r + i] -= sum[i];
-        }
-        for (int i = 0; i < 64; ++i)
-            x[64 * c + i] = known[i];
-    }
-#endif
-"""
-)
-
-_SUBSTITUTE_BACKWARD = (
-    _VECTORS
-    + """
-#ifdef PALPATE_TENSOR_CORES
-    __shared__ double part[8][64];
-    auto place = [=](int m) { return 2 * (8 * (m - m % 2) + 2 * row + m % 2); };
-    for (int c = own - 1; c >= 0; --c) {
-        double sum[4][2] = {};
-        for (int r = c + 1 + warp; r < rows; r += warps)
-            add_transposed(sum, tiles_of(r) + 1024 * c, x + 64 * r);
-        if (column == 0)
-            for (int m = 0; m < 4; ++m)
-                for (int n = 0; n < 2; ++n)
-                    part[warp][place(m) + n] = sum[m][n];
-        __syncthreads();
-        if (warp == 0) {
-            double* answer = x + 64 * c;
-            for (int i = lane; i < 64; i += 32) {
-                double value = answer[i];
-                for (int w = 0; w < warps; ++w)
-                    value -= part[w][i];
-                part[0][i] = value;  // nobody else has read this one
-            }
-            __syncwarp();
-            double known[4][2] = {};
-            add_transposed(known, tiles_of(c) + 1024 * c, part[0]);
-            if (column == 0)
-                for (int m = 0; m < 4; ++m)
-                    for (int n = 0; n < 2; ++n)
-                        answer[place(m) + n] = known[m][n];
-        }
-        __syncthreads();
-    }
-#else
-    for (int c = own - 1; c >= 0; --c) {
-        double known[64], sum[64] = {};
-        for (int i = 0; i < 64; ++i)
-            known[i] = x[64 * c + i];
-        for (int r = rows - 1; r >= c; --r) {
-            const double* tile = tiles_of(r) + 1024 * c;
-            for (int k = 0; k < 32; ++k)
-                for (int i = 0; i < 32; ++i)
-                    for (int n = 0; n < 2; ++n)
-                        if (r > c)
-                            known[2 * i + n] -= tile[32 * k + i] * x[64 * r + 2 * k + n];
-                        else
-                            sum[2 * i + n] += tile[32 * k + i] * known[2 * k + n];
-        }
-        for (int i = 0; i < 64; ++i)
-            x[64 * c + i] = sum[i];
-    }
-#endif
-"""
-)
-
 
 @wp.func_native(_SUBTRACT_PRODUCT)
 def subtract_product(
+    children: wp.array2d(dtype=wp.int32),
+    rows_in_child: wp.array(dtype=wp.int32),
+    child: int,
+    last_child: int,
+    first_share: int,
     panels: wp.array3d(dtype=wp.float64),
     left: int,
     right: int,
     count: int,
-    out: wp.array3d(dtype=wp.float64),
+    shares: wp.array3d(dtype=wp.float64),
     tile: int,
+    r: int,
+    c: int,
     thread: int,
 ):
-    """Subtract a row of ``count`` tiles times another row, transposed, from a tile of ``out``.
+    """Set a tile of a share to what the children's shares add up to, less a product.
 
-    All threads of two warps call it.
+    The product is that of two rows of ``count`` tiles, the second transposed. ``r`` and ``c`` are
+    the tile's place in the front, and ``tile`` that in ``shares``; the children are those of
+    `FrontTiles`, from ``child`` on, and ``first_share`` is the slot's first tile. All threads of
+    two warps call it.
     """
     ...
 
 
 @wp.func_native(_FACTORISE)
 def factorise_panel(
+    children: wp.array2d(dtype=wp.int32),
+    rows_in_child: wp.array(dtype=wp.int32),
+    child: int,
+    last_child: int,
+    first_share: int,
+    shares: wp.array3d(dtype=wp.float64),
+    sources_at: wp.array(dtype=wp.int32),
+    sources: wp.array(dtype=wp.int32),
+    first_tile: int,
+    values: wp.array2d(dtype=wp.float64),
+    slot: int,
     panels: wp.array3d(dtype=wp.float64),
     panel: int,
     own: int,
     rows: int,
-    slot: int,
     bad: wp.array(dtype=wp.int32),
     thread: int,
     threads: int,
 ):
-    """Factorise the own columns of a front, and divide the rows of its border.
+    """Gather and factorise the own columns of a front, and divide the rows of its border.
 
-    ``panel`` is the front's first tile, ``rows`` its rows of tiles. A diagonal tile becomes the
+    Children as for `subtract_product`; ``sources_at`` says for each tile of a matrix where the
+    numbers of its entries stand in ``sources``. ``first_tile`` is the front's first one in a
+    matrix, ``panel`` that in ``panels``, ``rows`` its rows of tiles. A diagonal tile becomes the
     inverse of its Cholesky factor; ``bad`` is set where a pivot is not positive, and a tile of ones
     on the diagonal takes its place. All threads of a block call it.
     """
-    ...
-
-
-@wp.func_native(_SUBSTITUTE_FORWARD)
-def substitute_forward(
-    panels: wp.array3d(dtype=wp.float64),
-    panel: int,
-    own: int,
-    rows: int,
-    work: wp.array2d(dtype=wp.float64),
-    begin: int,
-    thread: int,
-    threads: int,
-):
-    """Solve with the lower triangle of a front's own columns, and subtract from its border.
-
-    ``begin`` is the front's first row in ``work``, the rest as for `factorise_panel`.
-    """
-    ...
-
-
-@wp.func_native(_SUBSTITUTE_BACKWARD)
-def substitute_backward(
-    panels: wp.array3d(dtype=wp.float64),
-    panel: int,
-    own: int,
-    rows: int,
-    work: wp.array2d(dtype=wp.float64),
-    begin: int,
-    thread: int,
-    threads: int,
-):
-    """Solve with the transposed lower triangle, once the border's solution is in ``work``."""
     ...

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from palpate_fem.batched import factor_kernels as kernels
 from palpate_fem.batched import solve_kernels
 from palpate_fem.batched.dense_tiles import LANES, THREADS, TILE
-from palpate_fem.batched.factor_kernels import GATHERED
 from palpate_fem.batched.launches import Launches
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
 
@@ -33,9 +32,12 @@ class FrontTiles:
         panel_tiles: Tiles of all panels of one matrix.
         share_tiles: Tiles of all shares of one matrix.
         rows: Rows of all fronts, own and border, for one right-hand side.
-        fronts: A row for each front: own unknowns, own tiles, begin and end of its children, begin
-            of its shares, of its rows in its parent, of its rows in a vector, and of its panel,
-            and how many rows of tiles it has.
+        fronts: A row for each front: its own tiles, its rows of tiles, begin and end of its
+            children, and begin of its panel, of its share, and of its rows in a vector.
+        children: A row for each front, those with the same parent one after another: begin of its
+            parent's rows in ``rows_in_child``, of its share, and of its border in a vector.
+        rows_in_child: For each front, where each padded row of its parent is in its border; -1 =
+            nowhere. They rise where they are not -1.
         gflop: Operations of one factorisation with the padding [GFlop].
     """
 
@@ -55,32 +57,31 @@ class FrontTiles:
             if self.parent[k] >= 0:
                 self.level[self.parent[k]] = max(self.level[self.parent[k]], self.level[k] + 1)
         self.levels = int(self.level.max(initial=-1)) + 1
-        self.children = np.argsort(self.parent, kind="stable")
-        begins = np.searchsorted(self.parent[self.children], np.arange(count + 1))
-        self.fronts = np.zeros((count, 9), np.int64)
-        self.fronts[:, 0], self.fronts[:, 1] = own, o
+        children = np.argsort(self.parent, kind="stable")
+        begins = np.searchsorted(self.parent[children], np.arange(count + 1))
+        self.fronts = np.zeros((count, 7), np.int64)
+        self.fronts[:, 0], self.fronts[:, 1] = o, o + b
         self.fronts[:, 2], self.fronts[:, 3] = begins[:-1], begins[1:]
-        self.fronts[:, 4] = np.cumsum(share) - share
+        self.fronts[:, 4] = np.cumsum(panel) - panel
+        self.fronts[:, 5] = np.cumsum(share) - share
         self.fronts[:, 6] = np.cumsum((o + b) * TILE) - (o + b) * TILE
-        self.fronts[:, 7] = np.cumsum(panel) - panel
-        self.fronts[:, 8] = o + b
-        self._match_children(count)
+        border_begins = self.fronts[:, 6] + o * TILE
+        columns = (self._match_children(), self.fronts[:, 5], border_begins)
+        self.children = np.stack(columns, axis=1)[children]
         products = o * (o - 1) * (o + 1) // 6 + o * (o + 1) // 2  # of the own triangle
         products += b * o * (o + 1) // 2 + share * o
         self.gflop = float(products.sum()) * 2.0 * TILE**3 / 1e9
 
-    def _match_children(self, count: int) -> None:
-        """For each front, where each padded row of its parent is in its border; -1 = nowhere."""
-        found, begin = [], 0
-        for k, front in enumerate(self.tree.fronts):
-            self.fronts[k, 5] = begin
-            if front.parent < 0:
-                continue
-            rows = np.full((self.own_tiles + self.border_tiles)[front.parent] * TILE, -1, np.int64)
-            rows[self.rows_in(front.parent, front.border)] = np.arange(len(front.border))
-            found.append(rows)
-            begin += len(rows)
-        self.rows_in_child = np.concatenate(found or [np.zeros(0, np.int64)])
+    def _match_children(self) -> Ints:
+        """Make ``rows_in_child``; begins of the rows of each front's parent."""
+        sizes = np.where(self.parent >= 0, self.fronts[self.parent, 1] * TILE, 0)
+        begins = np.cumsum(sizes) - sizes
+        self.rows_in_child = np.full(sizes.sum(), -1, np.int64)
+        for k in np.flatnonzero(sizes):
+            border = self.tree.fronts[k].border
+            rows = begins[k] + self.rows_in(self.parent[k], border)
+            self.rows_in_child[rows] = np.arange(len(border))
+        return begins
 
     def rows_in(self, k: int, unknowns: Ints) -> Ints:
         """Padded rows of unknowns, in order of elimination, in a front that holds them."""
@@ -93,7 +94,7 @@ class FrontTiles:
         o = self.own_tiles[k]
         row = np.asarray(row)
         own, below = row * (row + 1) // 2, o * (o + 1) // 2 + (row - o) * o
-        return np.asarray(self.fronts[k, 7] + np.where(row < o, own, below))
+        return np.asarray(self.fronts[k, 4] + np.where(row < o, own, below))
 
 
 class BatchedFactor:
@@ -132,7 +133,6 @@ class BatchedFactor:
         self._known = wp.full((slots, len(indices)), np.nan, dtype=wp.float64, device=device)
         self._launch = Launches(device)
         self.bad = wp.zeros(slots, dtype=wp.int32, device=device)
-        self._loaded = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
         self.marked = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
         square = (TILE, TILE)
         self._panels = wp.zeros(
@@ -146,7 +146,6 @@ class BatchedFactor:
         self._children = self._ints(tiles.children)
         self._rows_in_child = self._ints(tiles.rows_in_child)
         self._parent = self._ints(tiles.parent)
-        self._plan_tiles()
         self._plan_entries(np.asarray(indptr), np.asarray(indices))
         self._plan_factor()
         self._plan_solve()
@@ -169,38 +168,22 @@ class BatchedFactor:
         count, tiles = len(slots), self.tiles
         self._mark(slots)
         sizes = [tiles.panel_tiles, tiles.share_tiles]
-        both = [self._panels, self._shares]
+        plan = [self._fronts, self._children, self._rows_in_child]
         for level in range(tiles.levels):
-            first, last = self._tile_begins[level : level + 2]
-            self._launch(
-                kernels.gather_shares,
-                (count, last - first, TILE * TILE // GATHERED),
-                [slots, self.marked, *self._tile_arrays, self._fronts, self._rows_in_child, first,
-                 *sizes],
-                both,
-            )  # fmt: skip
-            first, last = self._entry_begins[level : level + 2]
-            self._launch(
-                kernels.add_entries,
-                (count, last - first),
-                [slots, self.marked, self._entry_front, self._source, self._place, first,
-                 tiles.panel_tiles, self.values],
-                [self._panels],
-            )  # fmt: skip
             first, last = self._front_begins[level : level + 2]
             self._launch(
                 kernels.factorise_panels,
-                (count, last - first, THREADS),
-                [slots, self.marked, self._by_level, self._fronts, first, tiles.panel_tiles,
-                 THREADS],
+                (last - first, count, THREADS),
+                [slots, self.marked, self._by_level, *plan, self._sources_at, self._sources, first,
+                 *sizes, THREADS, self.values, self._shares],
                 [self._panels, self.bad],
             )  # fmt: skip
             first, last = self._product_begins[level : level + 2]
             self._launch(
                 kernels.subtract_products,
                 (count, last - first, 2 * TILE),
-                [slots, self.marked, self._products, first, *sizes],
-                both,
+                [slots, self.marked, self._products, *plan, first, *sizes, self._panels],
+                [self._shares],
             )
 
     def _mark(self, slots: wp.array) -> None:
@@ -209,12 +192,11 @@ class BatchedFactor:
         self._launch(
             kernels.begin_marks, (count, len(tiles.fronts)), [slots, self.bad], [self.marked]
         )
-        self._launch(kernels.clear, count, [slots], [self.bad])
         self._launch(
             kernels.mark_changed,
             (count, self.values.shape[1]),
             [slots, self._entry_front, self._parent, self.values],
-            [self._known, self.marked],
+            [self._known, self.marked, self.bad],
         )
 
     def solve(self, slots: wp.array, vectors: wp.array, lanes: int) -> None:
@@ -227,40 +209,24 @@ class BatchedFactor:
         """
         count, tiles = len(slots), self.tiles
         place = [tiles.panel_tiles, tiles.rows, THREADS]
-        self._launch(
-            solve_kernels.forget_loads, (count, len(tiles.fronts)), [slots], [self._loaded]
-        )
         for level in range(tiles.levels):
-            first, last = self._row_begins[level : level + 2]
-            self._launch(
-                solve_kernels.gather_right,
-                (count, last - first, LANES),
-                [slots, *self._row_arrays, self._fronts, self._children, self._rows_in_child,
-                 first, tiles.rows, lanes, vectors],
-                [self._work, self._loaded],
-            )  # fmt: skip
             first, last = self._front_begins[level : level + 2]
             self._launch(
                 solve_kernels.substitute_forward,
                 (count, last - first, THREADS),
-                [slots, self._by_level, self._fronts, first, *place, self._loaded],
-                [self._panels, self._work],
-            )
-        for level in reversed(range(tiles.levels)):
-            first, last = self._border_begins[level : level + 2]
-            self._launch(
-                solve_kernels.gather_border,
-                (count, last - first, LANES),
-                [slots, self._border_place, self._border_source, first, tiles.rows],
+                [slots, self._by_level, self._fronts, self._children, self._rows_in_child,
+                 self._row_links, first, *place, lanes, vectors, self._panels],
                 [self._work],
-            )
+            )  # fmt: skip
+        for level in reversed(range(tiles.levels)):
             first, last = self._front_begins[level : level + 2]
             self._launch(
                 solve_kernels.substitute_backward,
                 (count, last - first, THREADS),
-                [slots, self._by_level, self._fronts, first, *place],
-                [self._panels, self._work],
-            )
+                [slots, self._by_level, self._fronts, self._row_links, first, *place,
+                 self._panels],
+                [self._work],
+            )  # fmt: skip
         self._launch(
             solve_kernels.scatter_solution,
             (count, lanes, self.size),
@@ -268,125 +234,72 @@ class BatchedFactor:
             [vectors],
         )
 
-    def _plan_tiles(self) -> None:
-        """All tiles of all fronts, level after level, and the children that share in each."""
-        tiles = self.tiles
-        parts, sharing = [], []
-        for k in range(len(tiles.fronts)):
-            o, b = int(tiles.own_tiles[k]), int(tiles.border_tiles[k])
-            rows, columns = np.tril_indices(o + b)
-            place = tiles.row_tile(k, rows) + columns
-            share = columns >= o
-            r, c = rows[share] - o, columns[share] - o
-            place[share] = tiles.fronts[k, 4] + r * (r + 1) // 2 + c
-            children = tiles.children[tiles.fronts[k, 2] : tiles.fronts[k, 3]]
-            begins = tiles.fronts[children, 5, None] + np.arange((o + b) * TILE)
-            known = (tiles.rows_in_child[begins] >= 0).reshape(len(children), o + b, TILE).any(2)
-            tile, child = np.nonzero((known[:, rows] & known[:, columns]).T)
-            parts.append(np.stack((np.full(len(rows), k), rows, columns, place)))
-            sharing.append((np.bincount(tile, minlength=len(rows)), children[child]))
-        found = np.concatenate(parts, axis=1)
-        level = tiles.level[found[0]]
-        order = np.argsort(level, kind="stable")
-        self._tile_begins = np.searchsorted(level[order], np.arange(tiles.levels + 1)).tolist()
-        counts = np.concatenate([count for count, _ in sharing])
-        ends = np.cumsum(counts)
-        begin = ends - counts
-        numbers = [*found[:, order], begin[order], ends[order]]
-        self._tile_arrays = [self._ints(row) for row in numbers]
-        self._tile_arrays.append(self._ints(np.concatenate([child for _, child in sharing])))
-
     def _plan_entries(self, indptr: NDArray[Any], indices: NDArray[Any]) -> None:
-        """Places of the matrix's entries, level after level; both sides of diagonal tiles."""
+        """Which of the matrix's entries stands at which place of the tiles that have any.
+
+        A place takes one entry, or none (-1), or a one (-2): on the diagonal where it is padding.
+        """
         tiles, tree = self.tiles, self.tiles.tree
         new = np.empty(self.size, np.int64)
         new[tree.order] = np.arange(self.size)
         rows = np.repeat(np.arange(self.size), np.diff(indptr))
-        low, high = (
-            np.minimum(new[rows], new[indices]),
-            np.maximum(new[rows], new[indices]),
-        )
-        own = tiles.fronts[:, 0]
+        low, high = np.minimum(new[rows], new[indices]), np.maximum(new[rows], new[indices])
+        own = np.array([front.last - front.first for front in tree.fronts], np.int64)
         front = np.repeat(np.arange(len(own)), own)[low]
-        source, place, level = [], [], []
+        tile, within = np.empty(len(low), np.int64), np.empty(len(low), np.int64)
         order = np.argsort(front, kind="stable")
         begins = np.searchsorted(front[order], np.arange(len(own) + 1))
         for k, one in enumerate(tree.fronts):
             mine = order[begins[k] : begins[k + 1]]
             column, row = low[mine] - one.first, tiles.rows_in(k, high[mine])
-            tile = tiles.row_tile(k, row // TILE) + column // TILE
-            at = tile * TILE**2 + row % TILE * TILE + column % TILE
-            twin = (row // TILE == column // TILE) & (row != column)
-            mirrored = tile[twin] * TILE**2 + column[twin] % TILE * TILE + row[twin] % TILE
-            source.append(np.concatenate((mine, mine[twin])))
-            place.append(np.concatenate((at, mirrored)))
-            level.append(np.full(len(source[-1]), tiles.level[k]))
-        levels = np.concatenate(level)
-        order = np.argsort(levels, kind="stable")
-        self._entry_begins = np.searchsorted(levels[order], np.arange(tiles.levels + 1)).tolist()
+            tile[mine] = tiles.row_tile(k, row // TILE) + column // TILE
+            within[mine] = row % TILE * TILE + column % TILE
+        some, number = np.unique(tile, return_inverse=True)
+        sources_at = np.full(tiles.panel_tiles, -1, np.int64)
+        sources_at[some] = np.arange(len(some))
+        sources = np.full((len(some), TILE**2), -1, np.int32)
+        sources[number, within] = np.arange(len(low))
+        for k, o in enumerate(tiles.own_tiles):
+            last = sources[sources_at[tiles.row_tile(k, o - 1) + o - 1]]
+            last[(TILE + 1) * np.arange(own[k] - (o - 1) * TILE, TILE)] = -2
         self._entry_front = self._ints(front)
-        self._source = self._ints(np.concatenate(source)[order])
-        self._place = self._ints(np.concatenate(place)[order])
+        self._sources_at, self._sources = self._ints(sources_at), self._ints(sources.ravel())
 
     def _plan_factor(self) -> None:
         """Tiles of the shares, level after level."""
         tiles, products = self.tiles, []
         for k in np.argsort(tiles.level, kind="stable"):
-            o, b = int(tiles.own_tiles[k]), int(tiles.border_tiles[k])
-            first = tiles.row_tile(k, np.arange(o + b))
-            row, column = np.tril_indices(b)
+            row, column = np.tril_indices(int(tiles.border_tiles[k]))
             # Neighbours share rows of the panel: eight tiles have six rows.
             near = np.lexsort((column, row, column // 2, row // 4))
-            row, column = row[near], column[near]
-            place = tiles.fronts[k, 4] + row * (row + 1) // 2 + column
             same = np.full(len(row), 1)
-            rows = (
-                k * same,
-                place,
-                first[o + row],
-                first[o + column],
-                o * same,
-                tiles.level[k] * same,
-            )
+            rows = (k * same, row[near], column[near], tiles.level[k] * same)
             products.append(np.stack(rows, axis=1))
         found = np.concatenate(products)
         levels = np.arange(tiles.levels + 1)
-        self._product_begins = np.searchsorted(found[:, 5], levels).tolist()
-        self._products = self._ints(found[:, :5])
+        self._product_begins = np.searchsorted(found[:, 3], levels).tolist()
+        self._products = self._ints(found[:, :3])
 
     def _plan_solve(self) -> None:
-        """Rows of the fronts, level after level, and where their solutions come from."""
+        """Fronts, level after level, and what their rows stand for."""
         tiles, tree = self.tiles, self.tiles.tree
-        own_row = np.empty(self.size, np.int64)  # of an unknown, in order of elimination
-        for k, front in enumerate(tree.fronts):
-            begin = tiles.fronts[k, 6]
-            own_row[front.first : front.last] = begin + np.arange(front.last - front.first)
-        row_of = np.empty(self.size, np.int64)
-        row_of[tree.order] = own_row
-        self._row_of = self._ints(row_of)
-        order = np.argsort(tiles.level, kind="stable")
+        # In a level fronts with many tiles come first, so that none of them ends alone.
+        order = np.lexsort((-tiles.fronts[:, 0] * tiles.fronts[:, 1], tiles.level))
         self._by_level = self._ints(order)
         levels = np.arange(tiles.levels + 1)
         self._front_begins = np.searchsorted(tiles.level[order], levels).tolist()
-        rows, borders = [], []
-        for k in order:
-            front = tree.fronts[k]
-            level, o, b = int(tiles.level[k]), int(tiles.own_tiles[k]), int(tiles.border_tiles[k])
-            begin, size = int(tiles.fronts[k, 6]), (o + b) * TILE
-            unknown = np.full(size, -1, np.int64)
-            unknown[: front.last - front.first] = tree.order[front.first : front.last]
-            rows.append(
-                np.stack((np.full(size, k), np.arange(size), unknown, np.full(size, level)))
-            )
-            source = np.full(b * TILE, -1, np.int64)
-            source[: len(front.border)] = own_row[front.border]
-            at = begin + o * TILE + np.arange(b * TILE)
-            borders.append(np.stack((at, source, np.full(b * TILE, level))))
-        found, far = np.concatenate(rows, axis=1), np.concatenate(borders, axis=1)
-        self._row_begins = np.searchsorted(found[3], levels).tolist()
-        self._row_arrays = [self._ints(row) for row in found[:3]]
-        self._border_begins = np.searchsorted(far[2], levels).tolist()
-        self._border_place, self._border_source = self._ints(far[0]), self._ints(far[1])
+        own_row = np.empty(self.size, np.int64)  # of an unknown, in order of elimination
+        links = np.full(tiles.rows, -1, np.int64)
+        for k, front in enumerate(tree.fronts):
+            rows = tiles.fronts[k, 6] + np.arange(front.last - front.first)
+            own_row[front.first : front.last] = rows
+            links[rows] = tree.order[front.first : front.last]
+        for k, front in enumerate(tree.fronts):
+            begin = tiles.fronts[k, 6] + tiles.own_tiles[k] * TILE
+            links[begin : begin + len(front.border)] = own_row[front.border]
+        row_of = np.empty(self.size, np.int64)
+        row_of[tree.order] = own_row
+        self._row_links, self._row_of = self._ints(links), self._ints(row_of)
 
     def _ints(self, values: NDArray[Any]) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=self._device)

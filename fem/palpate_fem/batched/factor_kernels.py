@@ -16,14 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from palpate_fem.batched import dense_tiles
-from palpate_fem.batched.dense_tiles import THREADS, TILE
-
-GATHERED = 8
-"""Entries of a tile that one thread gathers: all at once, so that none waits for another."""
-
-EVERY = wp.constant(TILE // GATHERED)
-
-Entries = wp.types.vector(length=GATHERED, dtype=wp.float64)
+from palpate_fem.batched.dense_tiles import THREADS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,12 +39,6 @@ def begin_marks(
 
 
 @wp.kernel
-def clear(slots: wp.array(dtype=wp.int32), bad_out: wp.array(dtype=wp.int32)):
-    """Call the listed matrices good."""
-    bad_out[slots[wp.tid()]] = 0
-
-
-@wp.kernel
 def mark_changed(
     slots: wp.array(dtype=wp.int32),
     front_of: wp.array(dtype=wp.int32),
@@ -59,13 +46,17 @@ def mark_changed(
     values_in: wp.array2d(dtype=wp.float64),
     known: wp.array2d(dtype=wp.float64),
     marked: wp.array2d(dtype=wp.int32),
+    bad_out: wp.array(dtype=wp.int32),
 ):
     """Mark the fronts of entries that are not what they were, and all above; remember the entries.
 
-    Whoever finds a front marked may stop there: who marked it goes on upwards.
+    Whoever finds a front marked may stop there: who marked it goes on upwards. All listed matrices
+    are called good until they are factorised.
     """
     i, k = wp.tid()
     slot = slots[i]
+    if k == 0:
+        bad_out[slot] = 0
     value = values_in[slot, k]
     if value != known[slot, k]:
         known[slot, k] = value
@@ -75,110 +66,44 @@ def mark_changed(
             front = parent[front]
 
 
-@wp.kernel
-def gather_shares(
-    slots: wp.array(dtype=wp.int32),
-    marked: wp.array2d(dtype=wp.int32),
-    tile_front: wp.array(dtype=wp.int32),
-    tile_row: wp.array(dtype=wp.int32),
-    tile_column: wp.array(dtype=wp.int32),
-    tile_place: wp.array(dtype=wp.int32),
-    sharing_begin: wp.array(dtype=wp.int32),
-    sharing_end: wp.array(dtype=wp.int32),
-    sharing: wp.array(dtype=wp.int32),
-    fronts: wp.array2d(dtype=wp.int32),
-    rows_in_child: wp.array(dtype=wp.int32),
-    first: int,
-    panel_tiles: int,
-    share_tiles: int,
-    panels: wp.array3d(dtype=wp.float64),
-    shares: wp.array3d(dtype=wp.float64),
-):
-    """Set tiles to what the children's shares add up to, and ones where columns are padding.
-
-    ``sharing`` lists, tile after tile, the children with rows and columns in it. A thread has one
-    column of a tile, and every `EVERY`-th row of it. ``fronts`` is that of `FrontTiles`.
-    """
-    i, number, thread = wp.tid()
-    slot = slots[i]
-    work = first + number
-    front = tile_front[work]
-    if marked[slot, front] != 0:
-        top = tile_row[work] * TILE + thread // TILE
-        column = tile_column[work] * TILE + thread % TILE
-        total = Entries()
-        for j in range(GATHERED):
-            row = top + j * EVERY
-            if row == column and row >= fronts[front, 0] and row < fronts[front, 1] * TILE:
-                total[j] = wp.float64(1.0)
-        for k in range(sharing_begin[work], sharing_end[work]):
-            child = sharing[k]
-            place = fronts[child, 5]
-            tile = slot * share_tiles + fronts[child, 4]
-            b = rows_in_child[place + column]
-            if b >= 0:
-                for j in range(GATHERED):
-                    a = rows_in_child[place + top + j * EVERY]
-                    low = wp.min(wp.max(a, 0), b)
-                    high = wp.max(a, b)
-                    at = tile + lower_tile(high // TILE, low // TILE)
-                    value = shares[at, high % TILE, low % TILE]
-                    if a >= 0:
-                        total[j] += value
-        at = slot * panel_tiles + tile_place[work]
-        if tile_column[work] < fronts[front, 1]:
-            for j in range(GATHERED):
-                panels[at, thread // TILE + j * EVERY, thread % TILE] = total[j]
-        else:
-            at = slot * share_tiles + tile_place[work]
-            for j in range(GATHERED):
-                shares[at, thread // TILE + j * EVERY, thread % TILE] = total[j]
-
-
-@wp.kernel
-def add_entries(
-    slots: wp.array(dtype=wp.int32),
-    marked: wp.array2d(dtype=wp.int32),
-    front: wp.array(dtype=wp.int32),
-    source: wp.array(dtype=wp.int32),
-    place: wp.array(dtype=wp.int32),
-    first: int,
-    panel_tiles: int,
-    values_in: wp.array2d(dtype=wp.float64),
-    panels: wp.array3d(dtype=wp.float64),
-):
-    """Add the matrix's entries; each place of a panel takes one."""
-    i, number = wp.tid()
-    slot = slots[i]
-    entry = source[first + number]
-    if marked[slot, front[entry]] != 0:
-        at = place[first + number]
-        tile = slot * panel_tiles + at // (TILE * TILE)
-        within = at % (TILE * TILE)
-        panels[tile, within // TILE, within % TILE] += values_in[slot, entry]
-
-
 @wp.kernel(launch_bounds=(THREADS, 2))
 def factorise_panels(
     slots: wp.array(dtype=wp.int32),
     marked: wp.array2d(dtype=wp.int32),
     listed: wp.array(dtype=wp.int32),
     fronts: wp.array2d(dtype=wp.int32),
+    children: wp.array2d(dtype=wp.int32),
+    rows_in_child: wp.array(dtype=wp.int32),
+    sources_at: wp.array(dtype=wp.int32),
+    sources: wp.array(dtype=wp.int32),
     first: int,
     panel_tiles: int,
+    share_tiles: int,
     threads: int,
+    values_in: wp.array2d(dtype=wp.float64),
+    shares_in: wp.array3d(dtype=wp.float64),
     panels: wp.array3d(dtype=wp.float64),
     bad: wp.array(dtype=wp.int32),
 ):
-    """Factorise the own columns of fronts: a block of threads for each."""
-    i, number, thread = wp.tid()
+    """Gather and factorise the own columns of fronts: a block of threads for each.
+
+    One front of all slots after another, so that they find the same numbers of places in caches.
+    """
+    number, i, thread = wp.tid()
     slot = slots[i]
     front = listed[first + number]
     if marked[slot, front] != 0:
-        panel = slot * panel_tiles + fronts[front, 7]
-        own = fronts[front, 1]
-        rows = fronts[front, 8]
-        dense_tiles.factorise_panel(panels, panel, own, rows, slot, bad, thread, threads)
+        own = fronts[front, 0]
+        rows = fronts[front, 1]
+        child = fronts[front, 2]
+        last_child = fronts[front, 3]
+        first_tile = fronts[front, 4]
+        panel = slot * panel_tiles + first_tile
+        first_share = slot * share_tiles
+        dense_tiles.factorise_panel(
+            children, rows_in_child, child, last_child, first_share, shares_in, sources_at,
+            sources, first_tile, values_in, slot, panels, panel, own, rows, bad, thread, threads,
+        )  # fmt: skip
 
 
 @wp.kernel(launch_bounds=(THREADS, 2))
@@ -186,22 +111,33 @@ def subtract_products(
     slots: wp.array(dtype=wp.int32),
     marked: wp.array2d(dtype=wp.int32),
     works: wp.array2d(dtype=wp.int32),
+    fronts: wp.array2d(dtype=wp.int32),
+    children: wp.array2d(dtype=wp.int32),
+    rows_in_child: wp.array(dtype=wp.int32),
     first: int,
     panel_tiles: int,
     share_tiles: int,
-    panels: wp.array3d(dtype=wp.float64),
+    panels_in: wp.array3d(dtype=wp.float64),
     shares: wp.array3d(dtype=wp.float64),
 ):
-    """Subtract the product of two rows of the panel from a tile of the share: two warps for each.
+    """Set tiles of shares to what the children's shares add up to, less the product of two rows.
 
-    A row of ``works``: the front, the tile, both rows' first tiles, and how many tiles they have.
+    Two warps for each. A row of ``works``: the front, and the tile's row and column in the share.
     """
     i, number, thread = wp.tid()
     slot = slots[i]
-    work = first + number
-    if marked[slot, works[work, 0]] != 0:
-        tile = slot * share_tiles + works[work, 1]
-        left = slot * panel_tiles + works[work, 2]
-        right = slot * panel_tiles + works[work, 3]
-        own = works[work, 4]
-        dense_tiles.subtract_product(panels, left, right, own, shares, tile, thread)
+    front = works[first + number, 0]
+    if marked[slot, front] != 0:
+        row = works[first + number, 1]
+        column = works[first + number, 2]
+        own = fronts[front, 0]
+        child = fronts[front, 2]
+        last_child = fronts[front, 3]
+        border = slot * panel_tiles + fronts[front, 4] + lower_tile(own, 0)
+        first_share = slot * share_tiles
+        tile = first_share + fronts[front, 5] + lower_tile(row, column)
+        dense_tiles.subtract_product(
+            children, rows_in_child, child, last_child, first_share,
+            panels_in, border + row * own, border + column * own, own,
+            shares, tile, own + row, own + column, thread,
+        )  # fmt: skip
