@@ -11,13 +11,14 @@ import pytest
 PROGRAM = """
 import importlib, sys
 import warp as wp
-from palpate_fem.batched.dense_tiles import THREADS
+from palpate_fem.batched.dense_tiles import THREADS, WIDE
 
 folder, arch = sys.argv[1:]
 for name in ("factor_kernels", "solve_kernels"):
     module = wp.get_module(importlib.import_module(f"palpate_fem.batched.{name}").__name__)
-    module.options["block_dim"] = THREADS
-    wp.compile_aot_module(module, device=None, arch=int(arch), module_dir=folder)
+    for block in (THREADS, WIDE):
+        module.options["block_dim"] = block
+        wp.compile_aot_module(module, device=None, arch=int(arch), module_dir=folder)
 """
 
 
@@ -35,4 +36,4 @@ def test_dense_tiles_compile_for_three_generations(tmp_path: Path, arch: int) ->
     assert done.returncode == 0, done.stdout + done.stderr
     sources = "".join(path.read_text() for path in tmp_path.glob("*.cu"))
     assert "mma.sync.aligned.m16n8k8" in sources
-    assert len([*tmp_path.glob("*.cubin"), *tmp_path.glob("*.ptx")]) == 2
+    assert len([*tmp_path.glob("*.cubin"), *tmp_path.glob("*.ptx")]) == 4

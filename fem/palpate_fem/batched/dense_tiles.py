@@ -25,8 +25,8 @@ TILE = 32
 LANES = 2
 """Vectors that are multiplied together."""
 
-THREADS = 256
-"""Threads of a block, which share a front."""
+THREADS, WIDE = 256, 512
+"""Threads of a block, which share a front: where there are many fronts, and where there are few."""
 
 TENSOR_CORES = """
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
@@ -219,7 +219,8 @@ _FACTORISE = (
             }
     };
     __shared__ double exchange[2][2][32];
-    const int warp = thread / 32, warps = threads / 32;  // eight
+    constexpr int warps = WP_TILE_BLOCK_DIM / 32, each = 32 / warps;
+    const int warp = thread / 32;
     bool all_good = true;
     for (int c = 0; c < own; ++c) {
         double* diagonal = tiles_of(c) + 1024 * c;
@@ -231,22 +232,22 @@ _FACTORISE = (
             subtract(sum, first + 1024 * c, first, tiles_of(c), c, half % 2);
         }
         __syncthreads();
-        // Every thread has four numbers of a row. Up to column k they are the inverse factor's,
+        // Every thread has some numbers of a row. Up to column k they are the inverse factor's,
         // which needs no room before; beyond, what elimination has left of the matrix.
-        double mine[4];
+        double mine[each];
         #pragma unroll
-        for (int t = 0; t < 4; ++t)
-            mine[t] = diagonal[32 * lane + warp + 8 * t];
+        for (int t = 0; t < each; ++t)
+            mine[t] = diagonal[32 * lane + warp + warps * t];
         bool good = true;
         for (int k = 0; k < 32; ++k) {
             double* of_column = exchange[k % 2][0];
             double* of_row = exchange[k % 2][1];
             #pragma unroll
-            for (int t = 0; t < 4; ++t) {
-                if (warp + 8 * t == k)
+            for (int t = 0; t < each; ++t) {
+                if (warp + warps * t == k)
                     of_column[lane] = mine[t];
                 if (lane == k)
-                    of_row[warp + 8 * t] = mine[t];
+                    of_row[warp + warps * t] = mine[t];
             }
             __syncthreads();
             const double pivot = of_column[k];
@@ -257,8 +258,8 @@ _FACTORISE = (
             scale *= 1.5 - 0.5 * pivot * scale * scale;
             const double factor = of_column[lane] * scale;
             #pragma unroll
-            for (int t = 0; t < 4; ++t) {
-                const int j = warp + 8 * t;
+            for (int t = 0; t < each; ++t) {
+                const int j = warp + warps * t;
                 const double other = (j > k ? of_column[j] : j < k ? of_row[j] : 1.0) * scale;
                 const double before = j == k ? 0.0 : mine[t];
                 if (lane > k)
@@ -268,8 +269,8 @@ _FACTORISE = (
             }
         }
         #pragma unroll
-        for (int t = 0; t < 4; ++t) {
-            const int j = warp + 8 * t;
+        for (int t = 0; t < each; ++t) {
+            const int j = warp + warps * t;
             diagonal[32 * lane + j] = good ? mine[t] : (j == lane ? 1.0 : 0.0);
         }
         all_good = all_good && good;
@@ -376,7 +377,6 @@ def factorise_panel(
     rows: int,
     bad: wp.array(dtype=wp.int32),
     thread: int,
-    threads: int,
 ):
     """Gather and factorise the own columns of a front, and divide the rows of its border.
 

@@ -19,8 +19,9 @@ _VECTORS = (
     double* x = slots_work + size_t(begin) * 2;
     const int* links = row_links.data + begin;
 #ifdef PALPATE_TENSOR_CORES
-    const int start = thread, step = threads;
-    const int lane = thread % 32, warp = thread / 32, warps = threads / 32;
+    const int start = thread, step = WP_TILE_BLOCK_DIM;
+    constexpr int warps = WP_TILE_BLOCK_DIM / 32;
+    const int lane = thread % 32, warp = thread / 32;
     const int row = lane / 4, column = 2 * (lane % 4);
     // The threads of columns 0 and 1 of B hold 32 rows of two numbers, the others zeros.
     auto number = [=](const double* known, int k) { return row < 2 ? known[2 * k + row] : 0.0; };
@@ -142,23 +143,26 @@ _SUBSTITUTE_BACKWARD = (
     }
 #ifdef PALPATE_TENSOR_CORES
     __syncthreads();
-    __shared__ double part[8][64];
+    constexpr int parts = 16;  // so that sums do not depend on the number of warps
+    __shared__ double part[parts][64];
     auto place = [=](int m) { return 2 * (8 * (m - m % 2) + 2 * row + m % 2); };
     for (int c = own - 1; c >= 0; --c) {
-        double sum[4][2] = {};
-        for (int r = c + 1 + warp; r < rows; r += warps)
-            add_transposed(sum, tiles_of(r) + 1024 * c, x + 64 * r);
-        if (column == 0)
-            for (int m = 0; m < 4; ++m)
-                for (int n = 0; n < 2; ++n)
-                    part[warp][place(m) + n] = sum[m][n];
+        for (int p = warp; p < parts; p += warps) {
+            double sum[4][2] = {};
+            for (int r = c + 1 + p; r < rows; r += parts)
+                add_transposed(sum, tiles_of(r) + 1024 * c, x + 64 * r);
+            if (column == 0)
+                for (int m = 0; m < 4; ++m)
+                    for (int n = 0; n < 2; ++n)
+                        part[p][place(m) + n] = sum[m][n];
+        }
         __syncthreads();
         if (warp == 0) {
             double* answer = x + 64 * c;
             for (int i = lane; i < 64; i += 32) {
                 double value = answer[i];
-                for (int w = 0; w < warps; ++w)
-                    value -= part[w][i];
+                for (int p = 0; p < parts; ++p)
+                    value -= part[p][i];
                 part[0][i] = value;  // nobody else has read this one
             }
             __syncwarp();
@@ -212,7 +216,6 @@ def substitute_forward(
     base: int,
     begin: int,
     thread: int,
-    threads: int,
 ):
     """Solve with the lower triangle of a front's own columns, and subtract from its border.
 
@@ -237,7 +240,6 @@ def substitute_backward(
     base: int,
     begin: int,
     thread: int,
-    threads: int,
 ):
     """Solve with the transposed lower triangle; the border's rows take what is solved above."""
     ...

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from palpate_fem.batched import factor_kernels as kernels
 from palpate_fem.batched import solve_kernels
-from palpate_fem.batched.dense_tiles import LANES, THREADS, TILE
+from palpate_fem.batched.dense_tiles import LANES, THREADS, TILE, WIDE
 from palpate_fem.batched.launches import Launches
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
 
@@ -132,6 +132,7 @@ class BatchedFactor:
         # No number is what it was before the first factorisation.
         self._known = wp.full((slots, len(indices)), np.nan, dtype=wp.float64, device=device)
         self._launch = Launches(device)
+        self._processors = wp.get_device(device).sm_count if self.values.device.is_cuda else 0
         self.bad = wp.zeros(slots, dtype=wp.int32, device=device)
         self.marked = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
         square = (TILE, TILE)
@@ -173,10 +174,11 @@ class BatchedFactor:
             first, last = self._front_begins[level : level + 2]
             self._launch(
                 kernels.factorise_panels,
-                (last - first, count, THREADS),
+                (last - first, count, block := self._block((last - first) * count)),
                 [slots, self.marked, self._by_level, *plan, self._sources_at, self._sources, first,
-                 *sizes, THREADS, self.values, self._shares],
+                 *sizes, self.values, self._shares],
                 [self._panels, self.bad],
+                block=block,
             )  # fmt: skip
             first, last = self._product_begins[level : level + 2]
             self._launch(
@@ -185,6 +187,10 @@ class BatchedFactor:
                 [slots, self.marked, self._products, *plan, first, *sizes, self._panels],
                 [self._shares],
             )
+
+    def _block(self, fronts: int) -> int:
+        """Threads for each of so many fronts: more if each has a processor to itself."""
+        return WIDE if fronts <= self._processors else THREADS
 
     def _mark(self, slots: wp.array) -> None:
         """Mark the fronts that have to be worked on."""
@@ -208,24 +214,26 @@ class BatchedFactor:
             lanes: How many of them, at most `LANES`.
         """
         count, tiles = len(slots), self.tiles
-        place = [tiles.panel_tiles, tiles.rows, THREADS]
+        place = [tiles.panel_tiles, tiles.rows]
         for level in range(tiles.levels):
             first, last = self._front_begins[level : level + 2]
             self._launch(
                 solve_kernels.substitute_forward,
-                (count, last - first, THREADS),
+                (count, last - first, block := self._block((last - first) * count)),
                 [slots, self._by_level, self._fronts, self._children, self._rows_in_child,
                  self._row_links, first, *place, lanes, vectors, self._panels],
                 [self._work],
+                block=block,
             )  # fmt: skip
         for level in reversed(range(tiles.levels)):
             first, last = self._front_begins[level : level + 2]
             self._launch(
                 solve_kernels.substitute_backward,
-                (count, last - first, THREADS),
+                (count, last - first, block := self._block((last - first) * count)),
                 [slots, self._by_level, self._fronts, self._row_links, first, *place,
                  self._panels],
                 [self._work],
+                block=block,
             )  # fmt: skip
         self._launch(
             solve_kernels.scatter_solution,

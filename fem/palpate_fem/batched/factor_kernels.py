@@ -16,7 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from palpate_fem.batched import dense_tiles
-from palpate_fem.batched.dense_tiles import THREADS
+from palpate_fem.batched.dense_tiles import THREADS, WIDE
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,7 +66,7 @@ def mark_changed(
             front = parent[front]
 
 
-@wp.kernel(launch_bounds=(THREADS, 2))
+@wp.kernel(launch_bounds=(WIDE, 1))
 def factorise_panels(
     slots: wp.array(dtype=wp.int32),
     marked: wp.array2d(dtype=wp.int32),
@@ -79,7 +79,6 @@ def factorise_panels(
     first: int,
     panel_tiles: int,
     share_tiles: int,
-    threads: int,
     values_in: wp.array2d(dtype=wp.float64),
     shares_in: wp.array3d(dtype=wp.float64),
     panels: wp.array3d(dtype=wp.float64),
@@ -102,7 +101,7 @@ def factorise_panels(
         first_share = slot * share_tiles
         dense_tiles.factorise_panel(
             children, rows_in_child, child, last_child, first_share, shares_in, sources_at,
-            sources, first_tile, values_in, slot, panels, panel, own, rows, bad, thread, threads,
+            sources, first_tile, values_in, slot, panels, panel, own, rows, bad, thread,
         )  # fmt: skip
 
 

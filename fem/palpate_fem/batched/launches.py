@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from palpate_fem.batched.dense_tiles import THREADS
@@ -21,27 +21,31 @@ class Launches:
 
     def __init__(self, device: str) -> None:
         self._device = device
-        self._kept: dict[Any, tuple[wp.Launch, Any, list[Any]]] = {}
+        self._kept: dict[Any, _KeptLaunch] = {}
 
     def __call__(
         self,
         kernel: wp.Kernel,
-        dim: Any,
+        dim: int | tuple[int, ...],
         inputs: list[Any],
         outputs: list[Any],
+        *,
+        block: int = THREADS,
     ) -> None:
         """Run a kernel with ``dim`` threads; none = nothing happens.
 
         Args:
-            kernel: A kernel; all have blocks of `THREADS`, so that modules are compiled once.
+            kernel: A kernel.
             dim: Number of threads, or of each dimension.
             inputs: Its first arguments.
             outputs: The others.
+            block: Threads of a block; one number for all kernels of a module, which is compiled
+                for it.
         """
-        if not np.prod(dim):
+        if dim == 0 or (isinstance(dim, tuple) and 0 in dim):
             return
         arguments = [*inputs, *outputs]
-        key = (kernel.module.name, kernel.key, *map(_identity, arguments))
+        key = (kernel, block, *map(_identity, arguments))
         kept = self._kept.get(key)
         if kept is None:
             command = wp.launch(
@@ -49,21 +53,35 @@ class Launches:
                 dim=dim,
                 inputs=inputs,
                 outputs=outputs,
-                block_dim=THREADS,
+                block_dim=block,
                 device=self._device,
                 record_cmd=True,
             )
             if len(self._kept) == KEPT:  # of callers with ever new arrays
                 self._kept.clear()
+            places = [place for place, one in enumerate(arguments) if _is_list(one)]
+            self._kept[key] = _KeptLaunch(command, dim, arguments, places)
         else:
-            command, known_dim, known = kept
-            if known_dim != dim:
+            command = kept.command
+            if kept.dim != dim:
                 command.set_dim(dim)
-            for place, (now, before) in enumerate(zip(arguments, known, strict=True)):
-                if now is not before and _is_list(now):
+                kept.dim = dim
+            for place in kept.lists:
+                now = arguments[place]
+                if now is not kept.arguments[place]:
                     command.set_param_at_index(place, now)
-        self._kept[key] = command, dim, arguments
+                    kept.arguments[place] = now
         command.launch()
+
+
+@dataclass(slots=True)
+class _KeptLaunch:
+    """A launch, its arguments, which it keeps alive, and the places of lists of integers."""
+
+    command: wp.Launch
+    dim: int | tuple[int, ...]
+    arguments: list[Any]
+    lists: list[int]
 
 
 def _is_list(argument: Any) -> bool:

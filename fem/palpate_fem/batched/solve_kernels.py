@@ -25,7 +25,6 @@ def substitute_forward(
     first: int,
     panel_tiles: int,
     rows: int,
-    threads: int,
     lanes: int,
     vectors_in: wp.array3d(dtype=wp.float64),
     panels_in: wp.array3d(dtype=wp.float64),
@@ -44,7 +43,7 @@ def substitute_forward(
     begin = fronts[front, 6]
     dense_vectors.substitute_forward(
         children, rows_in_child, child, last_child, row_links, vectors_in, slot, lanes,
-        panels_in, panel, own, count, work, base, begin, thread, threads,
+        panels_in, panel, own, count, work, base, begin, thread,
     )  # fmt: skip
 
 
@@ -57,7 +56,6 @@ def substitute_backward(
     first: int,
     panel_tiles: int,
     rows: int,
-    threads: int,
     panels_in: wp.array3d(dtype=wp.float64),
     work: wp.array2d(dtype=wp.float64),
 ):
@@ -71,7 +69,7 @@ def substitute_backward(
     base = slot * rows
     begin = fronts[front, 6]
     dense_vectors.substitute_backward(
-        row_links, panels_in, panel, own, count, work, base, begin, thread, threads
+        row_links, panels_in, panel, own, count, work, base, begin, thread
     )
 
 
