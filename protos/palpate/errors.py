@@ -67,6 +67,19 @@ class PalpateError(Exception):
         self.problem = problem
         self.remedy = remedy
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickled whole: an error of another process says what it said there."""
+        return _restored, (type(self), self.args, self.__dict__)
+
+
+def _restored(
+    kind: type[PalpateError], arguments: tuple[object, ...], values: dict[str, object]
+) -> PalpateError:
+    error = kind.__new__(kind, *arguments)
+    error.args = arguments
+    error.__dict__.update(values)
+    return error
+
 
 class ConfigError(PalpateError, ValueError):
     """A configuration file, key or flag is wrong; names key and file."""

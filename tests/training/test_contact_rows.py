@@ -63,6 +63,28 @@ def test_normal_follows_the_deformed_skin() -> None:
     np.testing.assert_allclose(normal[0], way, atol=1e-6)
 
 
+def test_centre_and_normal_are_the_sums_over_the_whole_skin() -> None:
+    """Beside plain loops over rows and triangles, on a bent skin that is touched in places."""
+    rng = np.random.default_rng(3)
+    mesh = plane(9)
+    moved = (1e-4 * rng.normal(size=(6, 81, 3))).astype(np.float32)
+    force = np.zeros((6, 81, 3), np.float32)
+    for row in range(6):
+        force[row, rng.choice(81, 7, replace=False)] = rng.normal((0.0, 0.0, 2.0), 0.5, (7, 3))
+    centre, normal = contact_of(mesh, moved, force)
+    for row in range(6):
+        points = mesh.nodes + moved[row]
+        normals = np.zeros((81, 3))
+        for face in mesh.outer_faces:
+            a, b, c = points[face]
+            normals[face] += np.cross(b - a, c - a)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        weight = np.maximum(0.0, -(force[row] * normals).sum(axis=1))
+        mean = weight @ normals
+        np.testing.assert_allclose(centre[row], weight @ points / weight.sum(), rtol=1e-6)
+        np.testing.assert_allclose(normal[row], mean / np.linalg.norm(mean), rtol=1e-5, atol=1e-7)
+
+
 @pytest.fixture
 def touched_rows(mixed_rows: list[MixedRows], skin: SkinMesh) -> list[MixedRows]:
     """The mixed rows with a force on two of the six outer nodes, along their normals."""

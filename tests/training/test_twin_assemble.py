@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
 from palpate_training.datasets.assembly import assemble_experiment, assemble_mixed
-from palpate_training.datasets.basis import subset
+from palpate_training.datasets.basis import encode, subset
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset, content_sha256
 from palpate_training.datasets.export import features
 from palpate_training.datasets.trials import MixedRows, TrialRows
+from palpate_training.experiment.generate import data_sets
+from palpate_training.experiment.generate.trials import TrialsDone, file_of, pack
+from palpate_training.experiment.generate.workers import WorkerProcesses
+
+sys.path.append(str(Path(__file__).parent))  # worker processes import the store by name
+stores: Any = importlib.import_module("plane_store")
+PlaneStore, PRESSES = stores.PlaneStore, stores.PRESSES
 
 MakeRows = Callable[..., TrialRows]
 
@@ -234,3 +246,141 @@ def test_a_mixed_subset_keeps_its_fields(mixed: MixedDataset) -> None:
     np.testing.assert_array_equal(
         few.displacement(slice(6, 12)), mixed.displacement(mixed.experiment.rows_of(4))
     )
+
+
+Assemble = Callable[..., data_sets.AssembledSets]
+
+
+@pytest.fixture
+def executed(tmp_path: Path, make_rows: MakeRows, provenance: Provenance) -> Assemble:
+    """Assembles trials of two units on all presses, one of which gave no rows on one unit."""
+    folder, store = tmp_path / "trials", PlaneStore(tmp_path / "store")
+    folder.mkdir()
+    store.path.write_text("")
+    for name in PRESSES:
+        lost = (("b", "not found"),) if name == "cube/00/normal" else ()
+        rows = tuple(make_rows(unit, name) for unit in ("a", "b")[: 2 - len(lost)])
+        done = TrialsDone(name, rows, lost, {"a": np.zeros((9, 19))}, believed=8)
+        file_of(folder, name).write_bytes(pack(done))
+    return partial(
+        data_sets.assemble,
+        store,
+        folder,
+        ("a", "b"),
+        provenance,
+        clearance_m=0.0,
+        on_progress=lambda *_: None,
+    )
+
+
+@pytest.fixture(scope="module")
+def processes() -> Iterator[WorkerProcesses]:
+    pool = WorkerProcesses(2)
+    yield pool
+    pool.close()
+
+
+def test_trials_that_cannot_be_mixed_are_dropped_with_a_reason(executed: Assemble) -> None:
+    done = executed()
+    assert [trial for trial, _ in done.dropped] == [
+        "a cube/03/normal",
+        "b cube/00/normal",
+        "b cube/03/normal",
+    ]
+    reasons = dict(done.dropped)
+    assert reasons["b cube/00/normal"] == "not found"
+    assert "reaches 0.1 N" in reasons["a cube/03/normal"]
+    assert done.experiment.trials == 2 * len(PRESSES) - 1
+    assert done.mixed.experiment.trials == 2 * len(PRESSES) - 3
+    assert done.mixed.basis.loss_mean < 1e-6
+
+
+def test_processes_make_the_same_data_sets(
+    executed: Assemble, processes: WorkerProcesses, tmp_path: Path
+) -> None:
+    here = executed()
+    there = executed(runner=processes, open_store=PlaneStore)
+    assert content_sha256(there.experiment) == content_sha256(here.experiment)
+    assert content_sha256(there.mixed) == content_sha256(here.mixed)
+    assert there.dropped == here.dropped
+    assert all(path.suffix == ".npz" for path in (tmp_path / "trials").iterdir()), "left behind"
+
+
+@pytest.mark.parametrize(
+    ("open_store", "sees_files"), [(None, True), (PlaneStore, False)], ids=["store", "files"]
+)
+def test_workers_that_cannot_read_do_nothing(
+    executed: Assemble, open_store: Any, *, sees_files: bool
+) -> None:
+    class Elsewhere:
+        def __init__(self) -> None:
+            self.sees_files = sees_files
+
+        def run(self, function: Any, tasks: Any) -> Any:
+            raise AssertionError("asked to work")
+
+    done = executed(runner=Elsewhere(), open_store=open_store)
+    assert content_sha256(done.mixed) == content_sha256(executed().mixed)
+
+
+def test_errors_of_processes_name_the_trial(
+    executed: Assemble, processes: WorkerProcesses, tmp_path: Path
+) -> None:
+    (tmp_path / "store").write_text("sphere/02/normal")
+    for more in ({}, {"runner": processes, "open_store": PlaneStore}):
+        with pytest.raises(DatasetError, match=r"35, 3\), the first had|one mesh"):
+            executed(**more)
+    (tmp_path / "store").write_text("")
+    damaged = file_of(tmp_path / "trials", "sphere/02/normal")
+    damaged.write_bytes(b"half")
+    for more in ({}, {"runner": processes, "open_store": PlaneStore}):
+        with pytest.raises(DatasetError, match=r"sphere__02__normal\.npz is damaged"):
+            executed(**more)
+
+
+def test_bases_of_some_trajectories_serve_all(
+    executed: Assemble,
+    processes: WorkerProcesses,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Four of ten are fitted; what is lost is measured on all, by the processes too."""
+    whole = executed().mixed
+    monkeypatch.setattr(data_sets, "FIT_TRAJECTORIES", 4)
+    read: list[str] = []
+    real = PlaneStore.trajectory
+
+    def counted(store: Any, name: str) -> Any:
+        read.append(name)
+        return real(store, name)
+
+    monkeypatch.setattr(PlaneStore, "trajectory", counted)
+    some = executed().mixed
+    assert read[:4] == [PRESSES[k] for k in (0, 3, 6, 9)]
+    assert read[4:] == list(PRESSES)
+    monkeypatch.undo()
+    assert len(some.basis.modes) < len(whole.basis.modes)
+    assert some.basis.loss_mean > whole.basis.loss_mean
+    store = PlaneStore(tmp_path / "store")
+    steps = [step for name in PRESSES for step in store.trajectory(name).steps]
+    moved = np.array([step.displacement for step in steps], np.float32)
+    moved = np.concatenate([moved, np.zeros((len(PRESSES), 36, 3), np.float32)])  # first touch
+    left = np.linalg.norm(moved - some.basis.decode(encode(some.basis, moved)), axis=2)
+    assert some.basis.loss_mean == pytest.approx(left.mean(), rel=1e-4)
+    assert some.basis.loss_max == pytest.approx(left.max(), rel=1e-4)
+    monkeypatch.setattr(data_sets, "FIT_TRAJECTORIES", 4)
+    again = executed(runner=processes, open_store=PlaneStore).mixed
+    assert content_sha256(again) == content_sha256(some)
+
+
+def test_a_field_of_another_mesh_beyond_the_fit_is_named(
+    executed: Assemble,
+    processes: WorkerProcesses,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(data_sets, "FIT_TRAJECTORIES", 4)
+    (tmp_path / "store").write_text("sphere/02/normal")
+    for more in ({}, {"runner": processes, "open_store": PlaneStore}):
+        with pytest.raises(DatasetError, match=r"[ab] sphere/02/normal: displacement has shape"):
+            executed(**more)

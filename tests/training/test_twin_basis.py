@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.basis import Blocks, encode, fit_basis, loss
+from palpate_training.datasets.basis import Blocks, FieldFile, encode, fit_basis, loss
 from palpate_training.datasets.experiment import FloatArray
 
 NODES = 30
@@ -75,6 +78,49 @@ def test_the_same_blocks_give_the_same_basis() -> None:
     data = fields(40, [1e-3, 1e-4])
     one, two = (fit_basis(in_blocks(data, 9)) for _ in range(2))
     np.testing.assert_array_equal(one.modes, two.modes)
+
+
+@pytest.mark.parametrize("count", [None, 3])
+def test_coefficients_have_few_digits_that_lose_nothing(count: int | None) -> None:
+    data = fields(200, [1e-3, 1e-4, 1e-5, 2e-6, 1e-7])
+    basis = fit_basis(in_blocks(data, 17), count=count)
+    assert basis.step > 0.0
+    assert math.frexp(basis.step)[0] == 0.5, "no power of two"
+    coefficients = encode(basis, data)
+    np.testing.assert_array_equal(coefficients / basis.step, np.rint(coefficients / basis.step))
+    exact = replace(basis, step=0.0)
+    np.testing.assert_allclose(encode(exact, data), coefficients, rtol=0, atol=basis.step)
+    assert basis.loss_mean <= 1.01 * loss(exact, in_blocks(data, 17))[0]
+    coarser = replace(basis, step=64 * basis.step)
+    assert loss(coarser, in_blocks(data, 17))[0] > 1.01 * basis.loss_mean, "too fine a step"
+
+
+def test_fields_on_disk_make_the_same_basis(tmp_path: Path) -> None:
+    data = fields(900, [1e-3, 1e-4, 1e-5])
+    with FieldFile(tmp_path) as file:
+        for block in in_blocks(data, 37)():
+            file.add(block)
+        blocks = list(file())
+        np.testing.assert_array_equal(np.concatenate(blocks), data)
+        assert 100 < max(len(block) for block in blocks) < 300, "too few rows, or all at once"
+        there, here = fit_basis(file), fit_basis(in_blocks(data, 37))
+    np.testing.assert_allclose(there.modes, here.modes, atol=1e-6)
+    assert there.loss_mean == pytest.approx(here.loss_mean, rel=1e-3)
+    assert there.step == here.step
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_blocks_of_two_meshes_stay_apart_on_disk(tmp_path: Path) -> None:
+    with FieldFile(tmp_path) as file:
+        file.add(np.zeros((2, 5, 3), np.float32))
+        file.add(np.zeros((2, 6, 3), np.float32))
+        with pytest.raises(DatasetError, match="one mesh"):
+            fit_basis(file)
+
+
+def test_a_disk_that_takes_no_fields_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"none.*fields cannot be kept there"):
+        FieldFile(tmp_path / "none")
 
 
 @pytest.mark.parametrize(

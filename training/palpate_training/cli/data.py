@@ -15,6 +15,7 @@ from palpate.errors import ConfigError
 from palpate.files.hdf5 import schema_of
 from palpate.process import typed_command
 from palpate_training.cli.experiment import new_table, print_trials, show
+from palpate_training.datasets.experiment import MIXED_SCHEMA
 from palpate_training.datasets.export import UNTOUCHED_ROWS, export_csv, export_published, features
 from palpate_training.datasets.features import (
     FEATURE_COLUMNS,
@@ -31,6 +32,7 @@ from palpate_training.datasets.ingest import (
 )
 from palpate_training.datasets.inspect import ExperimentContents, load
 from palpate_training.datasets.inspect import contents as experiment_contents
+from palpate_training.datasets.shrink import SMALL, SmallSize, shrink_file
 from palpate_training.datasets.trials import TRIALS_SCHEMA
 
 console = Console()
@@ -158,6 +160,35 @@ def data_features(
     rows = features(data, untouched_rows=untouched_rows, assumed_rest=assumed_rest)
     write_dataset(out, rows)
     console.print(contents(rows, str(out)))
+
+
+def data_shrink(
+    path: Annotated[Path, typer.Argument(metavar="MIXED", help="Mixed data set (.h5).")],
+    out: Annotated[Path, typer.Argument(help="Data set to write (.h5); must not exist.")],
+    trials: Annotated[
+        int, typer.Option(min=1, help="Trials to keep, drawn evenly over the indenters.")
+    ] = SMALL.trials,
+    rows: Annotated[
+        int, typer.Option(min=2, help="Rows of each trial, evenly spaced from first to last.")
+    ] = SMALL.rows,
+    modes: Annotated[
+        int, typer.Option(min=1, help="Modes of the displacement: the most important ones.")
+    ] = SMALL.modes,
+    force_modes: Annotated[
+        int, typer.Option(min=1, help="Modes of the contact forces: the most important ones.")
+    ] = SMALL.force_modes,
+) -> None:
+    """Mixed data set -> a small one of the same kind, to carry elsewhere.
+
+    Its losses are relative to the data set given.
+
+    palpate data shrink mixed.h5 small.h5 --trials 5000
+    """
+    size = SmallSize(trials, rows, modes, force_modes)
+    with console.status(f"reading {path.name}"):
+        small = shrink_file(path, out, size, command=typed_command())
+    console.print(experiment_table(experiment_contents(MIXED_SCHEMA.name, small), str(out)))
+    console.print(f"{out.stat().st_size / 1e6:.1f} MB")
 
 
 def experiment_table(found: ExperimentContents, title: str) -> Table:

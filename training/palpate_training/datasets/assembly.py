@@ -8,13 +8,13 @@ Trials put together to the data sets, in an order that does not depend on who fi
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.basis import encode
+from palpate_training.datasets.basis import FieldEncoder
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
@@ -179,34 +179,97 @@ def assemble_mixed(
     Raises:
         DatasetError: As in ``assemble_experiment``, or a field is of another mesh.
     """
-    rows, columns = [], []
-    for one in mixed:
-        _check_fields(one, mesh, contact=contact_basis is not None)
-        rows.append(one.rows)
-        column = {
-            "simulated_force": one.simulated_force.astype(np.float32),
-            "coefficients": encode(basis, one.displacement),
-        }
-        if contact_basis is not None and one.contact_force is not None:
-            column["forces"] = encode(contact_basis, one.contact_force)
-            column["centre"], column["normal"] = contact_of(
-                mesh, one.displacement, one.contact_force
+    encoder = TrialEncoder(mesh, basis, contact_basis)
+    return assemble_encoded(
+        (encoder(one) for one in mixed),
+        basis,
+        mesh,
+        provenance,
+        contact_basis=contact_basis,
+        unit_names=unit_names,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedTrial:
+    """What the mixed data set holds of a trial, R rows: small, so it travels between processes.
+
+    Attributes:
+        rows: The experiment.
+        simulated_force: [N], shape (R, 3).
+        coefficients: Of the displacement [m], shape (R, K).
+        contact: Centre of pressure [m], shape (R, 3), contact normal, shape (R, 3), and
+            coefficients of the contact forces [N], shape (R, F); None where they are left out.
+    """
+
+    rows: TrialRows
+    simulated_force: FloatArray
+    coefficients: FloatArray
+    contact: tuple[FloatArray, FloatArray, FloatArray] | None
+
+
+class TrialEncoder:
+    """Trials with fields to trials with coefficients; made once for many, as `FieldEncoder` is.
+
+    Attributes:
+        displacement: Encoder of the displacement.
+        contact_force: Of the contact forces; None = these are left out.
+    """
+
+    def __init__(
+        self, mesh: SkinMesh, basis: FieldBasis, contact_basis: FieldBasis | None = None
+    ) -> None:
+        self._mesh = mesh
+        self.displacement = FieldEncoder(basis)
+        self.contact_force = None if contact_basis is None else FieldEncoder(contact_basis)
+
+    def __call__(self, mixed: MixedRows) -> EncodedTrial:
+        """Check and encode a trial.
+
+        Raises:
+            DatasetError: A field is of another mesh or not finite, or a row is not in contact.
+        """
+        _check_fields(mixed, self._mesh, contact=self.contact_force is not None)
+        contact = None
+        if self.contact_force is not None and mixed.contact_force is not None:
+            contact = (
+                *contact_of(self._mesh, mixed.displacement, mixed.contact_force),
+                self.contact_force(mixed.contact_force),
             )
-        columns.append(column)
-    experiment, order = _experiment(rows, provenance, unit_names)
+        return EncodedTrial(
+            mixed.rows,
+            mixed.simulated_force.astype(np.float32),
+            self.displacement(mixed.displacement),
+            contact,
+        )
 
-    def joined(name: str) -> FloatArray:
-        return np.concatenate([columns[i][name] for i in order])
 
+def assemble_encoded(
+    trials: Iterable[EncodedTrial],
+    basis: FieldBasis,
+    mesh: SkinMesh,
+    provenance: Provenance,
+    *,
+    contact_basis: FieldBasis | None = None,
+    unit_names: tuple[str, ...] = (),
+) -> MixedDataset:
+    """The mixed data set of encoded trials, in any order; ``TrialEncoder`` had the same bases.
+
+    Raises:
+        DatasetError: As in ``assemble_experiment``.
+    """
+    encoded = list(trials)
+    experiment, order = _experiment([one.rows for one in encoded], provenance, unit_names)
+    held = [encoded[i] for i in order]
     contact = None
     if contact_basis is not None:
-        contact = SimulatedContact(
-            joined("centre"), joined("normal"), joined("forces"), contact_basis
-        )
+        parts = [one.contact for one in held if one.contact is not None]
+        centre, normal, forces = (np.concatenate([part[i] for part in parts]) for i in range(3))
+        contact = SimulatedContact(centre, normal, forces, contact_basis)
     return MixedDataset(
         experiment=experiment,
-        simulated_force=joined("simulated_force"),
-        coefficients=joined("coefficients"),
+        simulated_force=np.concatenate([one.simulated_force for one in held]),
+        coefficients=np.concatenate([one.coefficients for one in held]),
         basis=basis,
         mesh=mesh,
         contact=contact,
@@ -226,22 +289,35 @@ def contact_of(
         displacement: Of every node [m], shape (R, V, 3).
         contact_force: On the nodes of the outer surface [N], shape (R, O, 3); each row has some.
     """
+    # Of the skin, only triangles at a node that is touched in some row have a part in it.
+    touched = np.zeros(len(mesh.nodes), np.bool_)
     outer = mesh.outer_nodes
-    faces = np.searchsorted(outer, mesh.outer_faces)  # (F, 3), into the outer nodes
-    centres, normals = [], []
-    for moved, force in zip(displacement[:, outer], contact_force, strict=True):
-        points = mesh.nodes[outer] + moved
-        a, b, c = (points[faces[:, i]] for i in range(3))
-        area = np.cross(b - a, c - a)  # twice the area, outward
-        normal = np.zeros_like(points)
-        for corner in range(3):
-            np.add.at(normal, faces[:, corner], area)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        pressed = np.maximum(0.0, -np.sum(force * normal, axis=1))
-        centres.append(pressed @ points / pressed.sum())
-        mean = pressed @ normal
-        normals.append(mean / np.linalg.norm(mean))
-    return np.array(centres, np.float32), np.array(normals, np.float32)
+    touched[outer] = contact_force.any(axis=(0, 2))
+    around, faces = np.unique(
+        mesh.outer_faces[touched[mesh.outer_faces].any(axis=1)], return_inverse=True
+    )
+    points = mesh.nodes[around] + displacement[:, around]  # (R, A, 3)
+    normal = _normals(points, faces.reshape(-1, 3))
+    force = contact_force[:, np.searchsorted(outer, around)]
+    pressed = np.maximum(0.0, -np.sum(force * normal, axis=2))[:, None]  # (R, 1, A)
+    centre = (pressed @ points)[:, 0] / pressed.sum(axis=2)
+    mean = (pressed @ normal)[:, 0]
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    return centre.astype(np.float32), mean.astype(np.float32)
+
+
+def _normals(points: Floats, faces: npt.NDArray[np.int64]) -> Floats:
+    """Outward unit normals, shape (R, A, 3), of the nodes of triangles (F, 3) in R states."""
+    rows, count, _ = points.shape
+    a, b, c = (points[:, faces[:, corner]] for corner in range(3))
+    area = np.cross(b - a, c - a)  # twice the area, outward, (R, F, 3)
+    node = (faces.T.ravel() + count * np.arange(rows)[:, None]).ravel()  # of each state and corner
+    sums = [
+        np.bincount(node, np.tile(area[..., axis], 3).ravel(), minlength=rows * count)
+        for axis in range(3)
+    ]
+    normal = np.stack(sums, axis=1).reshape(points.shape)
+    return np.asarray(normal / np.linalg.norm(normal, axis=2, keepdims=True))
 
 
 def _check_fields(mixed: MixedRows, mesh: SkinMesh, *, contact: bool) -> None:

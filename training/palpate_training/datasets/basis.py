@@ -3,22 +3,29 @@
 A thousand trials are 1.5 GB of fields, so the fields come in blocks, several times over. The modes
 come from a randomised range finder with one power iteration (Halko, Martinsson and Tropp, SIAM
 Review 53, 2011), in float64 as squares of small modes would be lost in float32. The loss is then
-measured, on every row and with the float32 numbers that are stored, not inferred from singular
-values.
+measured, on every row and with the numbers that are stored, not inferred from singular values.
+
+Stored coefficients are multiples of a step, a power of two so fine that it changes the loss by less
+than one in a hundred: digits that say nothing about the field do not compress.
 
 A few trials of a data set, as a data set: a sample small enough to ship.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+import math
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
+from palpate.process import Closing
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     FieldBasis,
@@ -37,6 +44,72 @@ LOSS_MEAN_M = 1e-6
 _FIRST_MODES = 64
 _OVERSAMPLING = 10
 """Directions beyond the modes wanted, which make the last of these accurate (Halko et al.)."""
+
+_LOSS_RATIO = 1.01
+"""Mean loss with rounded coefficients over that with exact ones: at most."""
+
+_ROUNDING = 0.02
+"""Mean square of what the first step tried moves a node by, over the squared mean loss."""
+
+_ROWS = 200
+"""Rows that a block read from disk has at least: products of few rows use half of a processor."""
+
+
+class FieldFile(Closing):
+    """Blocks of fields on disk, for more of them than memory holds; read anew in each pass.
+
+    The file has no name: nothing is left of it when it is closed or the process ends, in any way.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Make it.
+
+        Args:
+            folder: Whose disk holds it.
+
+        Raises:
+            DatasetError: The disk refuses.
+        """
+        self._folder = folder
+        self._shapes: list[tuple[int, ...]] = []
+        try:
+            self._file = tempfile.TemporaryFile(dir=folder, buffering=0)
+        except OSError as error:
+            raise self._refused(error) from error
+
+    def add(self, block: FloatArray) -> None:
+        """Append a block, shape (R, V, 3).
+
+        Raises:
+            DatasetError: The disk refuses.
+        """
+        left = np.ascontiguousarray(block).reshape(-1).view(np.uint8).data
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+        except OSError as error:
+            raise self._refused(error) from error
+        last = self._shapes[-1] if self._shapes else (_ROWS,)
+        if last[0] < _ROWS and last[1:] == block.shape[1:]:
+            self._shapes[-1] = (last[0] + len(block), *last[1:])
+        else:
+            self._shapes.append(block.shape)
+
+    def __call__(self) -> Iterator[FloatArray]:
+        """All rows, in order, blocks put together to some hundred rows; one pass at a time."""
+        self._file.seek(0)
+        for shape in self._shapes:
+            yield np.fromfile(self._file, np.float32, math.prod(shape)).reshape(shape)
+
+    def close(self) -> None:
+        """Remove it."""
+        self._file.close()
+
+    def _refused(self, error: OSError) -> DatasetError:
+        return DatasetError(
+            f"{self._folder}: fields cannot be kept there: {error}",
+            remedy="check the folder's rights and free space: it takes some gigabytes",
+        )
 
 
 def fit_basis(
@@ -71,9 +144,10 @@ def fit_basis(
         shaped = modes.reshape(len(modes), *mean.shape).astype(np.float32)
         basis = _measured(blocks, FieldBasis(mean.astype(np.float32), shaped, 0.0, 0.0))
         if count is not None:
-            return basis
+            return with_step(basis, partial(_measured, blocks))
         if basis.loss_mean < loss_mean:
-            return _fewest(blocks, basis, loss_mean)
+            fewest = _fewest(blocks, basis, loss_mean)
+            return with_step(fewest, partial(_measured, blocks), below=loss_mean)
         if wanted == most:
             raise DatasetError(
                 f"{wanted} modes lose {basis.loss_mean:.3g} on average, allowed are"
@@ -83,22 +157,94 @@ def fit_basis(
         wanted = min(2 * wanted, most)
 
 
+def with_step(
+    exact: FieldBasis, measure: Callable[[FieldBasis], FieldBasis], *, below: float = math.inf
+) -> FieldBasis:
+    """A basis with the coarsest step that leaves its mean loss as it is, but for a hundredth.
+
+    Args:
+        exact: Without a step; its loss is known.
+        measure: Gives a basis with a step the loss that it has.
+        below: What the loss has to stay below, too [unit of the fields].
+    """
+    if exact.loss_mean <= 0.0:
+        return exact
+    # Modes are orthonormal: errors of K coefficients, step / sqrt(12) each, spread over V nodes.
+    spread = math.sqrt(12.0 * _ROUNDING * len(exact.mean) / len(exact.modes))
+    step: float = 2.0 ** math.floor(math.log2(exact.loss_mean * spread))
+    while True:
+        tried = measure(replace(exact, step=step))
+        if tried.loss_mean < below and tried.loss_mean <= _LOSS_RATIO * exact.loss_mean:
+            return tried
+        step /= 2.0  # small errors count for more where the loss is at few nodes
+
+
+class FieldEncoder:
+    """Fields to coefficients; made once for many fields, as it keeps the modes in float64."""
+
+    def __init__(self, basis: FieldBasis) -> None:
+        self.basis = basis
+        self._mean = basis.mean.reshape(-1)
+        self._modes = basis.modes.reshape(len(basis.modes), -1).astype(np.float64)
+
+    def __call__(self, fields: FloatArray) -> FloatArray:
+        """Coefficients, multiples of the basis's step, shape (R, K), of fields (R, V, 3)."""
+        flat = fields.reshape(len(fields), -1).astype(np.float64) - self._mean
+        return rounded(flat @ self._modes.T, self.basis.step)
+
+    def lost(self, fields: FloatArray) -> FieldLoss:
+        """What fields, shape (R, V, 3), lose when compressed."""
+        return lost(fields - self.basis.decode(self(fields)))
+
+
+@dataclass(frozen=True, slots=True)
+class FieldLoss:
+    """What fields lose when compressed: distances of nodes from their compressed form.
+
+    Attributes:
+        total: Sum over nodes and rows [unit of the fields].
+        nodes: How many these are.
+        largest: The largest of them [unit of the fields].
+    """
+
+    total: float
+    nodes: int
+    largest: float
+
+
+def lost(rest: FloatArray) -> FieldLoss:
+    """What is lost where fields differ from their compressed form by ``rest``, shape (R, V, 3)."""
+    square = np.square(rest, dtype=np.float64)
+    distance = np.sqrt(square[..., 0] + square[..., 1] + square[..., 2])
+    return FieldLoss(float(distance.sum()), distance.size, float(distance.max()))
+
+
+def mean_and_largest(losses: Iterable[FieldLoss]) -> tuple[float, float]:
+    """Mean and largest distance over all fields; summed in the order given."""
+    total, nodes, largest = 0.0, 0, 0.0
+    for one in losses:
+        total += one.total
+        nodes += one.nodes
+        largest = max(largest, one.largest)
+    return total / nodes, largest
+
+
+def rounded(coefficients: Floats | FloatArray, step: float) -> FloatArray:
+    """Coefficients as they are stored: the nearest multiples of a step; 0 = as they are."""
+    if step > 0.0:
+        coefficients = np.rint(coefficients / step) * step + 0.0  # + 0.0: no negative zero
+    return np.asarray(coefficients, np.float32)
+
+
 def encode(basis: FieldBasis, fields: FloatArray) -> FloatArray:
-    """Coefficients, shape (R, K), of fields, shape (R, V, 3)."""
-    flat = fields.reshape(len(fields), -1).astype(np.float64) - basis.mean.reshape(-1)
-    return np.asarray(flat @ basis.modes.reshape(len(basis.modes), -1).T, np.float32)
+    """Coefficients as they are stored, shape (R, K), of fields, shape (R, V, 3)."""
+    return FieldEncoder(basis)(fields)
 
 
 def loss(basis: FieldBasis, blocks: Blocks) -> tuple[float, float]:
     """Mean and largest distance of a node from its compressed form, over all rows."""
-    total, nodes, largest = 0.0, 0, 0.0
-    for block in blocks():
-        rest = block - basis.decode(encode(basis, block))
-        distance = np.linalg.norm(rest.astype(np.float64), axis=2)
-        total += float(distance.sum())
-        nodes += distance.size
-        largest = max(largest, float(distance.max()))
-    return total / nodes, largest
+    encoder = FieldEncoder(basis)
+    return mean_and_largest(encoder.lost(block) for block in blocks())
 
 
 def _measured(blocks: Blocks, basis: FieldBasis) -> FieldBasis:

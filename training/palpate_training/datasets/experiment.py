@@ -147,12 +147,15 @@ class FieldBasis:
         modes: Orthonormal over all 3 V values, shape (K, V, 3).
         loss_mean: Mean nodal distance between the fields and their compressed form.
         loss_max: Largest such distance of any node and row.
+        step: Coefficients that are made with this basis are multiples of it; 0 = not rounded, or
+            not known, as files do not hold it.
     """
 
     mean: FloatArray
     modes: FloatArray
     loss_mean: float
     loss_max: float
+    step: float = 0.0
 
     def decode(self, coefficients: FloatArray) -> FloatArray:
         """Fields, shape (N, V, 3), of coefficients (N, K)."""
@@ -168,7 +171,8 @@ class SimulatedContact:
     Attributes:
         centre: Centre of pressure on the deformed skin [m], shape (N, 3).
         normal: Contact normal, out of the skin, of unit length, shape (N, 3).
-        coefficients: Of the contact forces of each row [N], shape (N, K).
+        coefficients: Of the contact forces of each row [N], shape (N, K); rounded as those of the
+            displacement are.
         basis: What they are coefficients of: forces on the nodes of the outer surface [N], shape
             (O, 3).
     """
@@ -188,7 +192,8 @@ class MixedDataset:
     Attributes:
         experiment: The measured side.
         simulated_force: [N], shape (N, 3).
-        coefficients: Of the field of each row, shape (N, K).
+        coefficients: Of the field of each row [m], shape (N, K): multiples of a power of two that
+            is fine beside the basis's loss, which is measured with them.
         basis: What they are coefficients of.
         mesh: Whose nodes move.
         contact: How the indenter bears on the skin; None where the source does not say.

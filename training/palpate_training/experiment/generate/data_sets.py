@@ -1,24 +1,50 @@
-"""Stage three: the paper's data sets, purely experimental and mixed, of all that was executed."""
+"""Stage three: the paper's data sets, purely experimental and mixed, of all that was executed.
+
+Fields of thousands of trajectories do not fit in memory, and reading them takes most of the time.
+So the bases are fitted on some of them, on disk, and worker processes encode all, one at a time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.assembly import assemble_experiment, assemble_mixed, mix
-from palpate_training.datasets.basis import fit_basis
-from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.assembly import (
+    EncodedTrial,
+    TrialEncoder,
+    assemble_encoded,
+    assemble_experiment,
+    assemble_mixed,
+    mix,
+)
+from palpate_training.datasets.basis import (
+    Blocks,
+    FieldFile,
+    FieldLoss,
+    fit_basis,
+    mean_and_largest,
+)
+from palpate_training.datasets.container import Provenance, read_archive
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
+    FieldBasis,
     MixedDataset,
     SkinMesh,
 )
-from palpate_training.datasets.trials import MixedRows, SimulatedTrial, TrialRows
+from palpate_training.datasets.trials import (
+    MixedRows,
+    SimulatedTrial,
+    TrialRows,
+    trial_name,
+)
 from palpate_training.experiment.generate.simulator import (
     IndentationStore,
     OnProgress,
@@ -27,6 +53,7 @@ from palpate_training.experiment.generate.simulator import (
     travelled,
 )
 from palpate_training.experiment.generate.trials import file_of, read_trials
+from palpate_training.experiment.generate.workers import Answer, Task, TaskRunner
 
 Floats = npt.NDArray[np.float64]
 
@@ -36,6 +63,13 @@ SUBSET = 128
 FORCE_MODES = 160
 """Modes of the contact forces. Their patches are small and many, so no number of modes holds them
 as a few hundred hold the displacement; the data set says what is lost."""
+
+
+FIT_TRAJECTORIES = 1000
+"""Trajectories at most that the bases are fitted on: some gigabytes of fields on the disk."""
+
+OpenStore = Callable[[Path], IndentationStore]
+"""Opens a store in a worker; can be pickled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,41 +95,289 @@ def assemble(
     *,
     clearance_m: float,
     on_progress: OnProgress,
+    open_store: OpenStore | None = None,
+    runner: TaskRunner | None = None,
 ) -> AssembledSets:
     """Make both data sets.
 
+    The bases are fitted on ``FIT_TRAJECTORIES`` at most, spread evenly over all by name; what they
+    lose is measured on every step of every trajectory.
+
+    Args:
+        store: The simulations.
+        folder: The trials; takes the fields of the fit and the bases until the data sets are made.
+        unit_names: Of all specimens, in order.
+        provenance: Where the data sets come from.
+        clearance_m: How far from the skin simulated paths start [m].
+        on_progress: Called with the progress of each part of the work.
+        open_store: Opens the store in the processes of ``runner``.
+        runner: Its processes read and encode, if they see the files of this one; without both all
+            is done in this process.
+
     Raises:
-        DatasetError: A file is damaged, or nothing was executed.
+        DatasetError: A file is damaged, nothing was executed, or the disk refuses.
+        WorkerLostError: A worker died.
     """
     fingertip = store.fingertip()
-    names = [name for name in store.ids() if file_of(folder, name).exists()]
+    names = sorted(name for name in store.ids() if file_of(folder, name).exists())
     if not names:
         raise DatasetError(f"{folder} holds no trial", remedy="run the stages before")
-    outer = np.unique(fingertip.mesh.outer_faces)
-    rows: dict[str, tuple[TrialRows, ...]] = {}
-    simulated: dict[str, SimulatedTrial] = {}
-    dropped: list[tuple[str, str]] = []
-    for k, name in enumerate(names):
-        done = read_trials(folder, name)
-        dropped += [(f"{unit} {name}", why) for unit, why in done.dropped]
-        if done.rows:
-            rows[name] = done.rows
-            simulated[name] = simulated_trial(
-                name, store.trajectory(name), done.believed, clearance_m, outer
-            )
-        on_progress(k + 1, len(names), "read")
-    every = [one for some in rows.values() for one in some]
-    experiment = assemble_experiment(every, provenance, unit_names=unit_names)
-    mixed = join(
-        every,
-        simulated,
-        dropped,
-        fingertip,
+    if open_store is None or (runner is not None and not runner.sees_files):
+        runner = None
+    found: dict[str, ExecutedTrajectory] = {}
+    for name, executed in _answers(runner, partial(_executed, folder), names):
+        found[name] = executed
+        on_progress(len(found), len(names), "read")
+    held = [found[name] for name in names]
+    dropped = [lost for one in held for lost in one.dropped]
+    tasks = [one for one in held if one.rows]
+    experiment = assemble_experiment(
+        (rows for one in tasks for rows in one.rows), provenance, unit_names=unit_names
+    )
+    mesh = skin_mesh(fingertip)
+    bases = _fitted(store, folder, _spread(tasks), mesh, clearance_m, on_progress)
+    encoded: dict[str, EncodedTrajectory] = {}
+    with tempfile.TemporaryDirectory(prefix=".bases-", dir=folder) as shared:
+        encode: Callable[[ExecutedTrajectory], EncodedTrajectory]
+        if runner is None or open_store is None:
+            encode = TrajectoryEncoder(store, mesh, bases, clearance_m)
+        else:
+            path = Path(shared) / "bases.npz"
+            bases.write(path)
+            encode = partial(_encode, EncoderPlace(store.path, path, clearance_m, open_store))
+        for task, answer in _answers(runner, encode, tasks):
+            encoded[task.name] = answer
+            on_progress(len(encoded), len(tasks), "mixed data set")
+    answers = [encoded.pop(task.name) for task in tasks]
+    dropped += [lost for answer in answers for lost in answer.dropped]
+    bases = bases.measured(answers)
+    mixed = assemble_encoded(
+        (trial for answer in answers for trial in answer.trials),
+        bases.displacement,
+        mesh,
         provenance,
+        contact_basis=bases.contact_force,
         unit_names=unit_names,
-        on_progress=on_progress,
     )
     return AssembledSets(experiment, mixed, sorted(dropped))
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutedTrajectory:
+    """What was executed of a trajectory.
+
+    Attributes:
+        name: Its id.
+        believed: Steps of the simulation that are used.
+        rows: Of each trial that gave some.
+        dropped: Trial and reason of each that gave none.
+    """
+
+    name: str
+    believed: int
+    rows: tuple[TrialRows, ...]
+    dropped: tuple[tuple[str, str], ...]
+
+
+def _executed(folder: Path, name: str) -> ExecutedTrajectory:
+    done = read_trials(folder, name)
+    dropped = tuple((f"{unit} {name}", why) for unit, why in done.dropped)
+    return ExecutedTrajectory(name, done.believed, done.rows, dropped)
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedTrajectory:
+    """What the mixed data set holds of a trajectory; small.
+
+    Attributes:
+        trials: Its trials that could be mixed.
+        dropped: Trial and reason of each other.
+        displacement: What the displacement of its steps loses [m].
+        contact_force: What their contact forces lose [N].
+    """
+
+    trials: tuple[EncodedTrial, ...]
+    dropped: tuple[tuple[str, str], ...]
+    displacement: FieldLoss
+    contact_force: FieldLoss
+
+
+@dataclass(frozen=True, slots=True)
+class FieldBases:
+    """Bases of both fields.
+
+    Attributes:
+        displacement: Of the displacement [m].
+        contact_force: Of the contact forces [N].
+    """
+
+    displacement: FieldBasis
+    contact_force: FieldBasis
+
+    def measured(self, answers: Sequence[EncodedTrajectory]) -> FieldBases:
+        """With the losses of these trajectories."""
+        moved = mean_and_largest(answer.displacement for answer in answers)
+        pressed = mean_and_largest(answer.contact_force for answer in answers)
+        return FieldBases(
+            replace(self.displacement, loss_mean=moved[0], loss_max=moved[1]),
+            replace(self.contact_force, loss_mean=pressed[0], loss_max=pressed[1]),
+        )
+
+    def write(self, path: Path) -> None:
+        """Write them for workers to read.
+
+        Raises:
+            DatasetError: The disk refuses.
+        """
+        arrays = {
+            f"{name}/{key}": np.asarray(getattr(getattr(self, name), key))
+            for name in ("displacement", "contact_force")
+            for key in _BASIS_PARTS
+        }
+        try:
+            with path.open("wb") as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]
+        except OSError as error:
+            raise DatasetError(
+                f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
+            ) from error
+
+    @classmethod
+    def read(cls, path: Path) -> FieldBases:
+        """Read what ``write`` wrote.
+
+        Raises:
+            DatasetError: It is not there.
+        """
+        arrays = read_archive(path, lambda names: names, remedy="run the command again")
+
+        def basis(name: str) -> FieldBasis:
+            mean, modes, *numbers = (arrays[f"{name}/{key}"] for key in _BASIS_PARTS)
+            return FieldBasis(mean, modes, *(float(number) for number in numbers))
+
+        return cls(basis("displacement"), basis("contact_force"))
+
+
+_BASIS_PARTS = ("mean", "modes", "loss_mean", "loss_max", "step")
+
+
+class TrajectoryEncoder:
+    """Reads trajectories from a store, mixes and encodes their trials."""
+
+    def __init__(
+        self, store: IndentationStore, mesh: SkinMesh, bases: FieldBases, clearance_m: float
+    ) -> None:
+        self._store = store
+        self._outer = mesh.outer_nodes
+        self._clearance_m = clearance_m
+        self._encode = TrialEncoder(mesh, bases.displacement, bases.contact_force)
+
+    def __call__(self, task: ExecutedTrajectory) -> EncodedTrajectory:
+        """Encode the trials of a trajectory.
+
+        Raises:
+            DatasetError: It is damaged, or its fields are of another mesh.
+        """
+        simulated = simulated_trial(
+            task.name,
+            self._store.trajectory(task.name),
+            task.believed,
+            self._clearance_m,
+            self._outer,
+        )
+        dropped: list[tuple[str, str]] = []
+        trials = tuple(
+            self._encode(one) for one in _mixed(task.rows, {task.name: simulated}, dropped)
+        )
+        encode = self._encode
+        assert encode.contact_force is not None
+        assert simulated.contact_force is not None
+        return EncodedTrajectory(
+            trials,
+            tuple(dropped),
+            encode.displacement.lost(simulated.displacement),
+            encode.contact_force.lost(simulated.contact_force),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderPlace:
+    """What a worker makes its ``TrajectoryEncoder`` of; equal by the files that it names.
+
+    Attributes:
+        store: The simulations.
+        bases: File of the bases.
+        clearance_m: How far from the skin simulated paths start [m].
+        open_store: Opens the store.
+    """
+
+    store: Path
+    bases: Path
+    clearance_m: float
+    open_store: OpenStore = field(compare=False)
+
+
+@lru_cache(maxsize=1)
+def _encoder(place: EncoderPlace) -> TrajectoryEncoder:
+    store = place.open_store(place.store)
+    mesh = skin_mesh(store.fingertip())
+    return TrajectoryEncoder(store, mesh, FieldBases.read(place.bases), place.clearance_m)
+
+
+def _encode(place: EncoderPlace, task: ExecutedTrajectory) -> EncodedTrajectory:
+    return _encoder(place)(task)
+
+
+def _answers(
+    runner: TaskRunner | None, function: Callable[[Task], Answer], tasks: Iterable[Task]
+) -> Iterator[tuple[Task, Answer]]:
+    """Tasks and answers, in any order; in this process, one by one, without a runner.
+
+    Raises:
+        DatasetError: As the function does.
+    """
+    if runner is None:
+        yield from ((task, function(task)) for task in tasks)
+        return
+    yield from runner.run(function, tasks)
+
+
+Item = TypeVar("Item")
+
+
+def _spread(items: Sequence[Item]) -> list[Item]:
+    """Some of them, evenly: ``FIT_TRAJECTORIES``, or all where they are not more."""
+    count = min(FIT_TRAJECTORIES, len(items))
+    return [items[k] for k in np.linspace(0, len(items) - 1, count).round().astype(int)]
+
+
+def _fitted(
+    store: IndentationStore,
+    folder: Path,
+    some: Sequence[ExecutedTrajectory],
+    mesh: SkinMesh,
+    clearance_m: float,
+    on_progress: OnProgress,
+) -> FieldBases:
+    """Fit the bases on the fields of some trajectories, which are put on the disk of a folder."""
+    outer = mesh.outer_nodes
+    with FieldFile(folder) as displacement, FieldFile(folder) as contact_force:
+        for k, task in enumerate(some):
+            simulated = simulated_trial(
+                task.name, store.trajectory(task.name), task.believed, clearance_m, outer
+            )
+            displacement.add(simulated.displacement)
+            if simulated.contact_force is not None:
+                contact_force.add(simulated.contact_force)
+            on_progress(k + 1, len(some), "fields to fit")
+        return _fit(displacement, contact_force, on_progress)
+
+
+def _fit(displacement: Blocks, contact_force: Blocks, on_progress: OnProgress) -> FieldBases:
+    on_progress(0, 1, "basis of the fields")
+    basis = fit_basis(displacement)
+    on_progress(0, 1, "basis of the contact forces")
+    return FieldBases(basis, fit_basis(contact_force, count=FORCE_MODES))
 
 
 def join(
@@ -114,22 +396,20 @@ def join(
         DatasetError: Nothing is left.
     """
     mesh = skin_mesh(fingertip)
-    on_progress(0, 1, "basis of the fields")
-    basis = fit_basis(lambda: (trial.displacement for trial in simulated.values()))
-    on_progress(0, 1, "basis of the contact forces")
-    contact_basis = fit_basis(
+    bases = _fit(
+        lambda: (trial.displacement for trial in simulated.values()),
         lambda: (
             trial.contact_force for trial in simulated.values() if trial.contact_force is not None
         ),
-        count=FORCE_MODES,
+        on_progress,
     )
     on_progress(0, 1, "mixed data set")
     mixed = assemble_mixed(
         _mixed(rows, simulated, dropped),
-        basis,
+        bases.displacement,
         mesh,
         provenance,
-        contact_basis=contact_basis,
+        contact_basis=bases.contact_force,
         unit_names=unit_names,
     )
     on_progress(1, 1, "mixed data set")
@@ -168,14 +448,14 @@ def simulated_trial(
 
 def _mixed(
     rows: Sequence[TrialRows],
-    simulated: dict[str, SimulatedTrial],
+    simulated: Mapping[str, SimulatedTrial],
     dropped: list[tuple[str, str]],
 ) -> Iterator[MixedRows]:
     for one in rows:
         try:
             yield mix(one, simulated[one.header.trajectory])
         except DatasetError as error:
-            dropped.append((f"{one.header.unit} {one.header.trajectory}", str(error)))
+            dropped.append((trial_name(one.header), str(error)))
 
 
 def skin_mesh(fingertip: SimulatedFingertip) -> SkinMesh:

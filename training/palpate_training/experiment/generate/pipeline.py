@@ -29,7 +29,7 @@ from palpate_training.experiment.generate.simulator import (
     TwinSimulator,
 )
 from palpate_training.experiment.generate.trials import make_trials
-from palpate_training.experiment.generate.workers import TaskRunner, WorkerProcesses
+from palpate_training.experiment.generate.workers import WorkerProcesses
 
 EXPERIMENT, MIXED = "experiment.h5", "mixed.h5"
 STORE = "mechanics.sim"
@@ -113,6 +113,7 @@ def generate(
     keep_spec(folder, spec, specimens)
     seconds: dict[str, float] = {}
     cluster = RayCluster(ray) if ray is not None else None
+    processes = WorkerProcesses(workers)
     try:
         began = time.monotonic()
         path = folder / STORE
@@ -132,28 +133,45 @@ def generate(
             return None
         store = simulator.open_store(path)
         began = time.monotonic()
-        runner: TaskRunner = cluster if cluster is not None else WorkerProcesses(workers)
-        try:
-            complete = make_trials(
-                spec,
-                store,
-                specimens,
-                simulator,
-                folder / TRIALS,
-                runner,
-                on_progress=partial(on_stage, "trials"),
-                stop=stop,
-            )
-        finally:
-            if runner is not cluster:
-                runner.close()
+        complete = make_trials(
+            spec,
+            store,
+            specimens,
+            simulator,
+            folder / TRIALS,
+            processes if cluster is None else cluster,
+            on_progress=partial(on_stage, "trials"),
+            stop=stop,
+        )
         if not complete:
             return None
         seconds["trials"] = time.monotonic() - began
+        began = time.monotonic()
+        data, digest = _assemble(folder, spec, specimens, simulator, processes, on_stage, command)
     finally:
+        processes.close()
         if cluster is not None:
             cluster.close()
-    began = time.monotonic()
+    if not (folder / IDLE).exists():
+        pressed = simulator.make_specimens(store.fingertip(), specimens)()
+        write_idle(folder, specimens, pressed, seed=spec.seed)
+    write_experiment(folder / EXPERIMENT, data.experiment)
+    write_mixed(folder / MIXED, data.mixed)
+    seconds["data sets"] = time.monotonic() - began
+    return GeneratedExperiment(folder, data, digest, seconds, _sizes(folder))
+
+
+def _assemble(
+    folder: Path,
+    spec: ExperimentSpec,
+    specimens: Sequence[Specimen],
+    simulator: TwinSimulator,
+    processes: WorkerProcesses,
+    on_stage: OnStage,
+    command: str,
+) -> tuple[AssembledSets, str]:
+    """Both data sets, and the digest of all that decides their rows."""
+    store = simulator.open_store(folder / STORE)
     digest = provenance_sha256(spec, specimens, store.fingertip().key)
     provenance = Provenance(
         source=f"twin: {spec.presses} presses at random"
@@ -174,14 +192,10 @@ def generate(
         provenance,
         clearance_m=simulator.clearance_m,
         on_progress=partial(on_stage, "data sets"),
+        open_store=simulator.open_store,
+        runner=processes,
     )
-    if not (folder / IDLE).exists():
-        pressed = simulator.make_specimens(store.fingertip(), specimens)()
-        write_idle(folder, specimens, pressed, seed=spec.seed)
-    write_experiment(folder / EXPERIMENT, data.experiment)
-    write_mixed(folder / MIXED, data.mixed)
-    seconds["data sets"] = time.monotonic() - began
-    return GeneratedExperiment(folder, data, digest, seconds, _sizes(folder))
+    return data, digest
 
 
 def _sizes(folder: Path) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -12,6 +13,7 @@ from multiprocessing import get_context, parent_process
 from typing import Protocol, TypeVar
 
 from palpate.cluster import AHEAD, WorkerLostError
+from palpate.process import require
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
@@ -35,6 +37,13 @@ class TaskRunner(Protocol):
         """End the workers."""
 
 
+def begin_worker() -> None:
+    """Let a worker use one core: there are as many, and threads of each would only wait."""
+    end_with_parent()
+    importlib.import_module("scipy.linalg")  # brings a linear algebra of its own, as NumPy does
+    require("threadpoolctl", extra="training").threadpool_limits(1)
+
+
 def end_with_parent() -> None:
     """Let a worker not outlive a command that was killed: the pool would wait for ever."""
     parent = parent_process()
@@ -56,7 +65,7 @@ class WorkerProcesses:
         self._workers = workers
         # Spawned: forked children would share locks of threads that they do not have.
         self._pool = ProcessPoolExecutor(
-            workers, mp_context=get_context("spawn"), initializer=end_with_parent
+            workers, mp_context=get_context("spawn"), initializer=begin_worker
         )
 
     def run(
