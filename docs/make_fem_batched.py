@@ -1,6 +1,6 @@
 """Write docs/results/fem-batched.md and its picture from what the benchmark has measured on a GPU.
 
-    python tests/benchmarks/bench_batched.py ... --out h100.json
+    python tests/benchmarks/bench_batched.py ... --out slots.json
     python tests/benchmarks/bench_batched.py --edge-mm ... --out meshes.json
     python tests/benchmarks/bench_batched_factor.py ... --out factor.json
     python docs/make_fem_batched.py
@@ -27,6 +27,9 @@ from palpate_training.figures.style import (
 )
 
 ROOT = Path(__file__).resolve().parents[1]
+SAME_M = 1e-6
+"""Skins that are farther apart than this after the last step are two equilibria [m]."""
+
 FOLDER = ROOT / "docs" / "results" / "fem-batched"
 PAGE = FOLDER.with_suffix(".md")
 
@@ -71,8 +74,15 @@ def times(runs: list[dict[str, Any]]) -> str:
 
 def agreement(rows: list[dict[str, Any]], folder: Path) -> str:
     """How far the GPU and the CPU are apart."""
-    force = np.array([row["force_relative"] for row in rows])
-    field = 1e6 * np.array([row["last_field_m"] for row in rows])
+    near = [row for row in rows if row["last_field_m"] <= SAME_M]
+    force = np.array([row["force_relative"] for row in near])
+    field = 1e6 * np.array([row["last_field_m"] for row in near])
+    elsewhere = [
+        f" One more, {row['indenter']}, ends at another equilibrium: its force differs by "
+        f"{row['force_relative']:.1%}, its skin by {1e3 * row['last_field_m']:.2f} mm at one node."
+        for row in rows
+        if row not in near
+    ]
     equal = sum(row["outcome"][0] == row["outcome"][1] for row in rows)
     cpu_s = float(np.mean([row["cpu_s"] for row in rows]))
     figure = new_figure(7.0, 2.6)
@@ -88,9 +98,10 @@ def agreement(rows: list[dict[str, Any]], folder: Path) -> str:
         grid(axes)
     told = (
         f"{len(rows)} presses, computed on a core, too ({cpu_s:.0f} s of it each), both with "
-        f"default tolerances: outcomes equal in {equal}; net forces differ by "
+        f"default tolerances: outcomes equal in {equal}. In {len(near)} net forces differ by "
         f"{np.median(force):.1e} of the press's largest in the median, {force.max():.1e} at most; "
-        f"skins after the last step by {np.median(field):.3f} um, {field.max():.3f} at most."
+        f"skins after the last step by {np.median(field):.3f} um, {field.max():.3f} at most; "
+        f"{sum(force <= 1e-6)} forces are within 1e-6." + "".join(elsewhere)
     )
     finish(figure, folder / "agreement.png", "GPU against CPU", told)
     return f"{told}\n\n![agreement](fem-batched/agreement.png)"
@@ -143,13 +154,14 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
 
 def main() -> None:
     """Write page and pictures."""
-    report, meshes = read("h100.json"), read("meshes.json")
+    report, meshes = read("slots.json"), read("meshes.json")
     factor, sweeps = read("factor.json"), read("sweeps.json")
     runs = sorted(report["runs"], key=lambda run: int(run["slots"])) + meshes["runs"]
     draw(runs, FOLDER / "time.png")
     sections = [
         HEAD,
-        f"## Time\n\n{report['device']}: `{report['command']}` and `{meshes['command']}`\n",
+        f"## Time\n\n{report['device']}: `{report['command']}` and `{meshes['command']}`. "
+        f"{report['told']}\n",
         times(runs),
         "\n![time](fem-batched/time.png)\n",
         "## Agreement with the solver on a core\n",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 import time
 from collections import defaultdict
@@ -25,6 +26,9 @@ from palpate_fem.config import FingertipParameters
 from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
+
+
+COMMAND = "python tests/benchmarks/bench_batched_factor.py "
 
 
 def dominant(indptr: Any, indices: Any) -> Any:
@@ -106,7 +110,7 @@ def main() -> None:
     options = parser.parse_args()
     geometry = biotac(edge_m=1e-3 * options.edge_mm)
     pattern = Fingertip(geometry, FingertipParameters(), SolverSettings()).system.pattern
-    report = {"device": wp.get_device(options.device).name, "command": sys.argv, "runs": []}
+    report = {"device": wp.get_device(options.device).name, "command": COMMAND + shlex.join(sys.argv[1:]), "runs": []}
     for slots in options.slots:
         run = measure(pattern, slots, options.device)
         report["runs"].append(run)
