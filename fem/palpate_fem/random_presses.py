@@ -95,8 +95,13 @@ def random_presses(
     targets, normals = sample_targets(surface, count, seed=seed, region=REGION)
     for number, (target, normal) in enumerate(zip(targets, normals, strict=True)):
         name = indenters[number % len(indenters)]
-        segments = tuple(_segments(np.random.default_rng([seed, number])))
+        segments = segments_of(seed, number)
         yield RandomPress(f"{name}/{number:05d}/random", name, target, normal, segments, surface)
+
+
+def segments_of(seed: int, number: int) -> tuple[PathSegment, ...]:
+    """What a press does, by the seed of the draw and its number in it."""
+    return tuple(_segments(np.random.default_rng([seed, number])))
 
 
 def _segments(random: np.random.Generator) -> Iterator[PathSegment]:

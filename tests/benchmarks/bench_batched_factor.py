@@ -27,7 +27,6 @@ from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
 
-
 COMMAND = "python tests/benchmarks/bench_batched_factor.py "
 
 
@@ -110,7 +109,11 @@ def main() -> None:
     options = parser.parse_args()
     geometry = biotac(edge_m=1e-3 * options.edge_mm)
     pattern = Fingertip(geometry, FingertipParameters(), SolverSettings()).system.pattern
-    report = {"device": wp.get_device(options.device).name, "command": COMMAND + shlex.join(sys.argv[1:]), "runs": []}
+    report = {
+        "device": wp.get_device(options.device).name,
+        "command": COMMAND + shlex.join(sys.argv[1:]),
+        "runs": [],
+    }
     for slots in options.slots:
         run = measure(pattern, slots, options.device)
         report["runs"].append(run)

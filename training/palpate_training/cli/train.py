@@ -222,6 +222,13 @@ def train_transfer(
         int, typer.Option(min=1, help="How often the presses are drawn; results are means.")
     ] = 12,
     seed: Annotated[int, typer.Option(help="Of the draws.")] = 0,
+    pretrained: Annotated[
+        Path | None,
+        typer.Option(help="Folder of `palpate train population`; its network helps as --way says."),
+    ] = None,
+    way: Annotated[
+        str, typer.Option(help="How the network is used: input, rest-of-it, hidden or alone.")
+    ] = "input",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
     """Force on a finger that training has not met, and after a few presses of it.
@@ -231,11 +238,13 @@ def train_transfer(
     from palpate_training.evaluation.transfer import (
         FIGURES,
         fingers_of,
+        pretrained_from,
         run_transfer,
         steps_of,
         worst_of,
     )
 
+    helper = None if pretrained is None else pretrained_from(pretrained, way)
     known = [finger for path in train for finger in fingers_of(open_dataset(path))]
     tested = fingers_of(open_dataset(test))
     with _progress(Console(stderr=True)) as progress:
@@ -249,6 +258,7 @@ def train_transfer(
                 unlabelled=shots > 0 if unlabelled is None else unlabelled,
                 draws=draws,
                 seed=seed,
+                pretrained=helper,
                 on_step=lambda: progress.advance(bar),
             )
             for finger in tested
@@ -306,6 +316,54 @@ def train_features_command(
             on_epoch=on_epoch,
         )
     _show(report.metrics, f"{name} {version}: unseen presses", out)
+
+
+def train_population_command(
+    data: Annotated[
+        Path, typer.Argument(metavar="FEATURES.h5", help="Rows of a population of specimens.")
+    ],
+    out: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="For population.npz, .json and .onnx.")
+    ],
+    device: Annotated[str, typer.Option(help="Where it is trained: auto, cpu or cuda.")] = "auto",
+    seed: Seed = 0,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the rows at most.")] = 100,
+    batch_rows: Annotated[int, typer.Option(min=1, help="Rows in one step.")] = 4096,
+    width: Annotated[int, typer.Option(min=1, help="Of its layers.")] = 256,
+    blocks: Annotated[int, typer.Option(min=1, help="Residual blocks of two layers.")] = 3,
+    common: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, help="Share of the electrodes' common mode that it reads."),
+    ] = 1.0,
+    common_sd: Annotated[
+        float, typer.Option(min=0.0, help="Random offset of all electrodes in training [log Ohm].")
+    ] = 0.05,
+    gain_spread: GainSpread = GAIN_SPREAD,
+) -> None:
+    """One network for a population, tested on specimens and presses that it has not met.
+
+    palpate train population features.h5 runs/population --device cuda
+    """
+    from palpate_training.learning.population_net import PopulationConfig
+    from palpate_training.tasks.population import train_population
+
+    config = PopulationConfig(
+        epochs=epochs, batch_rows=batch_rows, width=width, blocks=blocks,
+        common=common, common_sd=common_sd, gain_sd=gain_spread,
+    )  # fmt: skip
+    with _progress() as progress:
+        bar = progress.add_task("population", total=epochs)
+        _, facts = train_population(
+            data, out, config=config, device=device, seed=seed,
+            on_epoch=lambda: progress.advance(bar),
+        )  # fmt: skip
+    for name, cell in facts["cells"].items():
+        rivals = [key for key, value in cell.items() if isinstance(value, dict)]
+        table = Table("", *rivals, title=f"{name.replace('_', ' ')}: {cell['presses']} presses")
+        for key in facts["ratio_unseen_to_seen_specimen"]:
+            table.add_row(key, *(f"{cell[rival].get(key, float('nan')):.3f}" for rival in rivals))
+        console.print(table)
+    console.print(f"wrote {out}")
 
 
 def train_upgrade(

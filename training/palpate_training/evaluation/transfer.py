@@ -13,17 +13,25 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from palpate.errors import DatasetError
+from palpate.errors import ConfigError, DatasetError
 from palpate_training.datasets.container import add_array
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.learning.baselines import ridge
 from palpate_training.learning.metrics import force_errors
-from palpate_training.systems.transfer import FingerRecording, ForceTransfer, LabelledPresses
+from palpate_training.learning.population_net import WEIGHTS, load_population_net
+from palpate_training.systems.transfer import (
+    WAYS,
+    FingerRecording,
+    ForceTransfer,
+    LabelledPresses,
+    Pretrained,
+)
 
 Floats = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.integer]
@@ -95,6 +103,19 @@ def _finger(data: FeatureDataset, sensor: int) -> Finger:
     return Finger(data.sensor_names[sensor], recording, data.tared_counts[rows])
 
 
+def pretrained_from(folder: Path, way: str) -> Pretrained:
+    """The network that ``palpate train population`` left in a folder, to be used in a way.
+
+    Raises:
+        ConfigError: There is no such way.
+        DatasetError: The folder holds no network.
+    """
+    for known in WAYS:
+        if way == known:
+            return Pretrained(load_population_net(folder / WEIGHTS), known)
+    raise ConfigError(f"no way {way!r} to use a network", remedy=f"choose from {', '.join(WAYS)}")
+
+
 def run_transfer(
     train: Sequence[Finger],
     test: Finger,
@@ -103,6 +124,7 @@ def run_transfer(
     unlabelled: bool = False,
     draws: int = 12,
     seed: int = 0,
+    pretrained: Pretrained | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """Fit to some fingers, and measure on another.
@@ -114,6 +136,7 @@ def run_transfer(
         unlabelled: Whether mean and spread of its electrodes may be used.
         draws: How often the labelled presses are drawn; results are means over the draws.
         seed: Of the draws.
+        pretrained: A network of a population that helps; None = none does.
         on_step: Called ``steps_of`` times, for a progress bar.
 
     Returns:
@@ -138,8 +161,8 @@ def run_transfer(
             remedy=f"label at most {len(pieces) - 1}, so that some are left to test",
         )
     sources = [finger.recording for finger in train]
-    width = _width_on_others(train, on_step)
-    model = ForceTransfer(sources)
+    width = _width_on_others(train, pretrained, on_step)
+    model = ForceTransfer(sources, pretrained)
     on_step()
     zero = model.estimate(test.recording, unlabelled=unlabelled)
     on_step()
@@ -179,6 +202,7 @@ def run_transfer(
         "unlabelled": unlabelled,
         "draws": draws if shots else 1,
         "seed": seed,
+        **({} if pretrained is None else {"pretrained": pretrained.way}),
         "rows": len(test.recording.force),
     }
 
@@ -232,7 +256,9 @@ def _width(estimate: Floats, truth: Floats) -> float:
     return float(np.quantile(errors / (FLOOR_N + np.linalg.norm(estimate, axis=1)), LEVEL))
 
 
-def _width_on_others(train: Sequence[Finger], on_step: Callable[[], None]) -> float:
+def _width_on_others(
+    train: Sequence[Finger], pretrained: Pretrained | None, on_step: Callable[[], None]
+) -> float:
     """The same from the training fingers: each estimated from the others, or a half from the other.
 
     Halves of one finger know nothing of what differs from finger to finger, so the intervals of one
@@ -249,7 +275,8 @@ def _width_on_others(train: Sequence[Finger], on_step: Callable[[], None]) -> fl
         held_out = [([halves[1 - k]], halves[k]) for k in range(2)]
     estimates, truths = [], []
     for sources, tested in held_out:
-        estimates.append(ForceTransfer(sources).estimate(tested, unlabelled=False))
+        model = ForceTransfer(sources, pretrained)
+        estimates.append(model.estimate(tested, unlabelled=False))
         truths.append(tested.force)
         on_step()
     return _width(np.vstack(estimates), np.vstack(truths))

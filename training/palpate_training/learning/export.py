@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from palpate import __version__
-from palpate.errors import BundleError
+from palpate.errors import BundleError, MissingExtraError
 from palpate.files.bundle import FieldMesh, Manifest, write_bundle
 from palpate.files.tasks import TASKS, tensors_of
 from palpate.files.training_range import KnownInputs
@@ -372,6 +373,21 @@ def check_parity(
     return worst
 
 
+def frame_s(model: bytes, input_name: str, frame: FloatArray, frames: int = 500) -> float:
+    """Median time of one frame ``(1, I)`` on one thread [s].
+
+    Raises:
+        MissingExtraError: onnxruntime is not installed.
+    """
+    session = _session(model)
+    taken = []
+    for _ in range(frames):
+        begun = time.perf_counter()
+        session.run(None, {input_name: frame})
+        taken.append(time.perf_counter() - begun)
+    return float(np.median(taken))
+
+
 def run_onnx(
     model: bytes, input_name: str, inputs: FloatArray
 ) -> tuple[list[FloatArray], list[FloatArray]]:
@@ -381,16 +397,23 @@ def run_onnx(
         BundleError: The file does not run.
         MissingExtraError: onnxruntime is not installed.
     """
-    runtime = require("onnxruntime", extra="training")
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = 1
     try:
-        session = runtime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        session = _session(model)
         together = session.run(None, {input_name: inputs})
         single = [session.run(None, {input_name: inputs[i : i + 1]}) for i in range(len(inputs))]
+    except MissingExtraError:
+        raise
     except Exception as error:  # ONNX Runtime's errors share no public base class
         raise BundleError(
             f"ONNX Runtime refuses the exported model: {error}",
             remedy="check the operator set against the installed onnxruntime",
         ) from error
     return together, [np.concatenate(parts) for parts in zip(*single, strict=True)]
+
+
+def _session(model: bytes) -> Any:
+    """A model in ONNX Runtime, on one thread."""
+    runtime = require("onnxruntime", extra="training")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return runtime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

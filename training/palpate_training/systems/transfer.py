@@ -11,6 +11,9 @@ From a finger's electrodes *without* forces comes more about the direction: a re
 spread, electrode by electrode, take the place of the other fingers'. From a few *labelled* presses
 comes a correction that reaches as far as what was pressed, by the common mode, too.
 
+A network of a simulated population may be given, too (``Pretrained``); whether it helps is in
+training/LOG.md.
+
 All constants were chosen on the two fingers of the LASA force calibration, in both directions, the
 worse counting, and then frozen (training/LOG.md).
 """
@@ -18,8 +21,9 @@ worse counting, and then frozen (training/LOG.md).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +32,13 @@ from scipy.signal import lfilter
 
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
 from palpate_training.learning.electrode_nets import MIRROR_AXES
+from palpate_training.learning.networks import predict
+from palpate_training.learning.population_net import (
+    PopulationNet,
+    hidden_axes,
+    hidden_values,
+    inputs_of,
+)
 from palpate_training.systems.samples import impedance_ohm
 
 Floats = npt.NDArray[np.float64]
@@ -118,6 +129,9 @@ class FingerRecording:
         segment: Number of the uninterrupted piece that each row belongs to, shape (N,).
         period_s: Time between two rows [s].
         force: [N], sensor frame, shape (N, 3).
+        prior: Force that processes learn what is left of [N], shape (N, 3).
+        extra: What they read besides, shape (N, E).
+        extra_signs: What a mirror image makes of that, 1 or -1, shape (E,).
     """
 
     electrodes: Counts
@@ -125,11 +139,16 @@ class FingerRecording:
     segment: npt.NDArray[np.integer]
     period_s: float
     force: Floats
+    prior: Floats | None = None
+    extra: Floats | None = None
+    extra_signs: Floats = field(default_factory=lambda: np.ones(0))
 
     def parts(self, inputs: Inputs) -> list[Floats]:
-        """Present values, then their differences from moving means, each of shape (N, 19)."""
+        """Present values, then their differences from moving means, each of shape (N, 19 + E)."""
         values = np.log(impedance_ohm(self.electrodes) / impedance_ohm(self.baseline))
         values -= (1.0 - inputs.common) * values.mean(axis=1, keepdims=True)
+        if self.extra is not None:
+            values = np.hstack([values, self.extra])
         means = (self._moving_mean(values, context_s) for context_s in inputs.contexts_s)
         return [values, *(values - mean for mean in means)]
 
@@ -140,6 +159,8 @@ class FingerRecording:
             electrodes=self.electrodes[:, ELECTRODE_MIRROR],
             baseline=self.baseline[:, ELECTRODE_MIRROR],
             force=self.force * MIRROR_AXES,
+            prior=None if self.prior is None else self.prior * MIRROR_AXES,
+            extra=None if self.extra is None else self.extra * self.extra_signs,
         )
 
     def _moving_mean(self, values: Floats, context_s: float) -> Floats:
@@ -153,6 +174,47 @@ class FingerRecording:
                 [share], [1.0, share - 1.0], piece, axis=0, zi=(1.0 - share) * piece[:1]
             )
         return mean
+
+
+Way = Literal["input", "rest-of-it", "hidden", "alone"]
+"""Of using a network: its force as input of the processes; processes of what its scaled force
+leaves; its hidden values as input; or its scaled force alone."""
+
+WAYS: tuple[Way, ...] = get_args(Way)
+
+HIDDEN = 4
+"""Principal hidden values that processes read, even ones and as many odd ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pretrained:
+    """A network, how it is used, and what was fitted to the sources: its scale, its axes."""
+
+    net: PopulationNet
+    way: Way = "input"
+    scale: float = 1.0
+    axes: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def fitted(self, sources: Sequence[FingerRecording]) -> Pretrained:
+        """The same, scaled on recordings with their forces."""
+        inputs = [inputs_of(source.electrodes, source.baseline) for source in sources]
+        guess = np.vstack([predict(self.net, rows)[:, :3] for rows in inputs]).astype(np.float64)
+        force = np.vstack([source.force for source in sources])
+        scale = float((guess * force).sum() / max((guess * guess).sum(), 1e-12))
+        axes = hidden_axes(self.net, np.vstack(inputs), HIDDEN)
+        return replace(self, scale=scale, axes=axes)
+
+    def told(self, recording: FingerRecording) -> FingerRecording:
+        """The recording with what the network says of it."""
+        inputs = inputs_of(recording.electrodes, recording.baseline)
+        if self.way == "hidden":
+            hidden = hidden_values(self.net, inputs) @ self.axes
+            signs = np.repeat([1.0, -1.0], HIDDEN)
+            return replace(recording, extra=hidden, extra_signs=signs)
+        force = self.scale * predict(self.net, inputs)[:, :3].astype(np.float64)
+        if self.way == "input":
+            return replace(recording, extra=force, extra_signs=MIRROR_AXES.astype(np.float64))
+        return replace(recording, prior=force)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +244,8 @@ class _Scale:
     ) -> Floats:
         """Inputs of some rows, shape (M, D)."""
         parts = np.hstack([part[rows] for part in recording.parts(inputs)])
-        weight = np.repeat([1.0, *[inputs.weight] * len(inputs.contexts_s)], ELECTRODES)
+        channels = parts.shape[1] // (1 + len(inputs.contexts_s))
+        weight = np.repeat([1.0, *[inputs.weight] * len(inputs.contexts_s)], channels)
         return np.asarray(weight * (parts - self.centre) / self.spread)
 
 
@@ -200,7 +263,7 @@ class _Process:
             some = np.unique(some)
             for one in (source, source.mirrored()):
                 rows.append(self._scale_of(one).apply(one, inputs, some))
-                targets.append(one.force[some])
+                targets.append(one.force[some] - (0.0 if one.prior is None else one.prior[some]))
         self._rows = np.vstack(rows)
         force = np.vstack(targets)
         self._unit = force.std()
@@ -217,7 +280,8 @@ class _Process:
         rows = self._scale_of(recording).apply(recording, self._inputs, everything)
         parts = np.array_split(rows, max(1, len(rows) // 4000))
         estimate = [self._kernel(part, self._rows) @ self._weight for part in parts]
-        return np.asarray(self._unit * np.vstack(estimate))
+        learned = self._unit * np.vstack(estimate)
+        return np.asarray(learned if recording.prior is None else recording.prior + learned)
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,8 +313,13 @@ class CorrectedForces:
 class ForceTransfer:
     """Estimates forces on fingers that are not among those it was fitted to."""
 
-    def __init__(self, sources: Sequence[FingerRecording]) -> None:
-        """Fit to recordings of other fingers, with their forces."""
+    def __init__(
+        self, sources: Sequence[FingerRecording], pretrained: Pretrained | None = None
+    ) -> None:
+        """Fit to recordings of other fingers, with their forces; with a pre-trained network."""
+        self._prior = None if pretrained is None else pretrained.fitted(sources)
+        if self._prior is not None:
+            sources = [self._prior.told(source) for source in sources]
         self._sources = sources
         self._scale = _Scale.shared(sources, CORRECTION_INPUTS)
         # Some estimate both magnitude and direction.
@@ -271,6 +340,11 @@ class ForceTransfer:
             unlabelled: Whether mean and spread of all its electrodes may be used, later rows
                 included; else a row's estimate follows from the tare and the rows before it.
         """
+        if self._prior is not None:
+            recording = self._prior.told(recording)
+            if self._prior.way == "alone":
+                assert recording.prior is not None
+                return recording.prior
         forces = {each: process(recording) for each, process in self._processes.items()}
         direction = _mean_direction([forces[each] for each in DIRECTION])
         if unlabelled:
@@ -290,6 +364,8 @@ class ForceTransfer:
             labelled: Which rows.
         """
         everything = np.arange(len(estimate))
+        if self._prior is not None:
+            recording = self._prior.told(recording)
         rows = self._scale.apply(recording, CORRECTION_INPUTS, everything)
         known = rows[labelled.rows]
         error = recording.force[labelled.rows] - estimate[labelled.rows]

@@ -1,0 +1,305 @@
+"""Write docs/results/population.md: a large simulated set, and one network for its specimens.
+
+    palpate fem units draw 100 --seed 1 --out units.json
+    palpate data generate FOLDER --random 20000 --seed 1 --units units.json --units-each 2 ...
+    python docs/make_population.py --set FOLDER/mixed.h5 --seed 1      statistics of the set
+    palpate train population features.h5 OUT                            OUT/population.json
+    python docs/make_population.py --network NAME OUT                   keeps that report
+    python docs/make_population.py                                      page and pictures
+
+What the commands wrote is in docs/results/population.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_fem.random_presses import segments_of
+from palpate_training.datasets.experiment import MixedDataset, read_mixed
+from palpate_training.figures.style import (
+    finish,
+    grid,
+    label,
+    markdown_table,
+    new_figure,
+    unit_colour,
+)
+
+Floats = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "docs" / "results" / "population"
+PAGE = FOLDER.with_suffix(".md")
+SET = "set.json"
+
+ENDS = (5.0, 50.0, 95.0)
+HARD_N = 2.0
+CELLS = {
+    "seen_specimen_seen_press": "learned from",
+    "seen_specimen_unseen_press": "specimen seen, press not",
+    "unseen_specimen_seen_press": "specimen not, press seen",
+    "unseen_specimen_unseen_press": "neither seen",
+}
+FIGURES = {
+    "force_magnitude_n": "force [N]",
+    "force_from_2n_percent": "force from 2 N [%]",
+    "force_angle_rad": "its angle [rad]",
+    "contact_location_mm": "contact location [mm]",
+    "centre_of_pressure_mm": "centre of pressure [mm]",
+    "normal_angle_rad": "contact normal [rad]",
+}
+
+
+def statistics(parts: list[MixedDataset], seed: int) -> dict[str, Any]:
+    """Numbers and bands of a set that was generated in one or several parts."""
+    rows: dict[str, list[Floats]] = {}
+    names: set[str] = set()
+    trials = 0
+    for data in parts:
+        names |= set(data.experiment.trajectories)
+        trials += data.experiment.trials
+        for name, values in columns(data).items():
+            rows.setdefault(name, []).append(values)
+    values = {name: np.concatenate(some) for name, some in rows.items()}
+    planned = {key: [] for key in ("tilt", "depth", "slide", "twist")}
+    for name in sorted(names):
+        first, *move = segments_of(seed, number_of(name))
+        planned["tilt"].append(np.degrees(first.angle_rad))
+        planned["depth"].append(1e3 * (first.amount or 0.0))
+        for one in move:
+            amount = abs(one.amount or 0.0)
+            planned[one.kind].append(1e3 * amount if one.kind == "slide" else np.degrees(amount))
+    bands = {
+        "tilt [deg]": planned["tilt"],
+        "depth [mm]": planned["depth"],
+        "slide, of those that do [mm]": planned["slide"],
+        "twist, of those that do [deg]": planned["twist"],
+    } | values
+    return {
+        "numbers": {
+            "presses with rows": len(names),
+            "of these slide": len(planned["slide"]),
+            "of these twist": len(planned["twist"]),
+            "trials": trials,
+            "rows": len(values["force [N]"]),
+            "specimens": len({unit for data in parts for unit in data.experiment.unit_names}),
+            "indenters": dict(sorted(Counter(name.split("/")[0] for name in names).items())),
+            f"share of rows from {HARD_N:g} N": float(np.mean(values["force [N]"] >= HARD_N)),
+            "share of rows from 8 N": float(np.mean(values["force [N]"] >= 8.0)),
+        },
+        "bands": {name: np.percentile(some, ENDS).tolist() for name, some in bands.items()},
+        "map": placed(parts),
+    }
+
+
+def number_of(name: str) -> int:
+    """Number of a press at random, by its name."""
+    found = re.fullmatch(r"[^/]+/(\d+)/random", name)
+    if found is None:
+        raise SystemExit(f"{name} is no press at random")
+    return int(found[1])
+
+
+def columns(data: MixedDataset) -> dict[str, Floats]:
+    """Values of every row that bands are made of."""
+    experiment, contact = data.experiment, data.contact
+    assert contact is not None
+    force = np.linalg.norm(experiment.force, axis=1)
+    along = np.abs(np.sum(data.simulated_force * contact.normal, axis=1))
+    across = np.sqrt(np.maximum(np.sum(data.simulated_force**2, axis=1) - along**2, 0.0))
+    tared = 4095.0 * experiment.tared.astype(np.float64)
+    hard = tared[force >= HARD_N]
+    last = np.flatnonzero(np.diff(experiment.trial, append=-1))
+    found: dict[str, Floats] = {
+        "force [N]": force,
+        "largest force of a press [N]": np.maximum.reduceat(
+            force, np.flatnonzero(np.diff(experiment.trial, prepend=-1))
+        ),
+        "shear over normal force [1]": across / np.maximum(along, 1e-9),
+        "travel from 0.5 N to the end [mm]": 1e3 * experiment.travel_m[last],
+        "contact location x [mm]": 1e3 * experiment.location[:, 0],
+        "contact location y [mm]": 1e3 * experiment.location[:, 1],
+        "centre of pressure x [mm]": 1e3 * contact.centre[:, 0],
+        "centre of pressure y [mm]": 1e3 * contact.centre[:, 1],
+        "location to centre of pressure [mm]": 1e3
+        * np.linalg.norm(experiment.location - contact.centre, axis=1),
+        "contact normal to straight down [deg]": np.degrees(
+            np.arccos(np.clip(-contact.normal[:, 2], -1.0, 1.0))
+        ),
+        f"electrodes that rise, from {HARD_N:g} N": (hard > 0.0).sum(axis=1).astype(np.float64),
+        f"most negative electrode from {HARD_N:g} N [counts]": hard.min(axis=1),
+        f"most positive electrode from {HARD_N:g} N [counts]": hard.max(axis=1),
+        f"mean of the electrodes from {HARD_N:g} N [counts]": hard.mean(axis=1),
+    }
+    for electrode in (1, 7, 8, 10, 17, 19):
+        found[f"E{electrode} at rest [counts]"] = experiment.trial_rest[:, electrode - 1]
+        found[f"E{electrode} from {HARD_N:g} N [counts]"] = hard[:, electrode - 1]
+    return {name: np.asarray(values, np.float64) for name, values in found.items()}
+
+
+def placed(parts: list[MixedDataset]) -> dict[str, Any]:
+    """How many rows have their centre of pressure where, on a grid of 0.5 mm."""
+    points = np.concatenate([part.contact.centre for part in parts if part.contact is not None])
+    x, y = np.arange(-18.0, 8.01, 0.5), np.arange(-8.0, 8.01, 0.5)
+    count, _, _ = np.histogram2d(1e3 * points[:, 0], 1e3 * points[:, 1], bins=(x, y))
+    return {"x_mm": x.tolist(), "y_mm": y.tolist(), "rows": count.astype(int).tolist()}
+
+
+def draw_set(found: dict[str, Any], path: Path) -> None:
+    """Where and how hard the set was pressed, and what electrodes make of it."""
+    figure = new_figure(9.5, 3.4)
+    where, electrodes = figure.subplots(1, 2)
+    grid_of = found["map"]
+    rows = np.array(grid_of["rows"], float).T
+    rows[rows == 0.0] = np.nan
+    where.pcolormesh(grid_of["x_mm"], grid_of["y_mm"], rows, cmap="Blues")
+    where.set_aspect("equal")
+    label(where, "x, to the tip [mm]", "y [mm]", "rows by centre of pressure")
+    names = [name for name in found["bands"] if name.startswith("E") and "from" in name]
+    for k, name in enumerate(names):
+        low, middle, high = found["bands"][name]
+        electrodes.plot([k, k], [low, high], color=unit_colour(0), lw=5, solid_capstyle="butt")
+        electrodes.plot([k], [middle], "o", color="white", ms=4)
+    electrodes.set_xticks(range(len(names)), [name.split()[0] for name in names])
+    label(electrodes, "", "tared counts", f"5 to 95 % of rows from {HARD_N:g} N, and median")
+    grid(electrodes, "y")
+    finish(figure, path, "The set", "Pad seen through the skin; the clamp is at x = -14 mm.")
+
+
+def draw_networks(networks: dict[str, dict[str, Any]], path: Path) -> None:
+    """Errors on presses that were not seen, beside those of ridge and constant."""
+    figure = new_figure(9.5, 3.0)
+    shown = [key for key in FIGURES if key != "force_angle_rad"]
+    report = networks[next(iter(networks))]
+    cells = list(CELLS)[1::2]
+    for k, (axes, key) in enumerate(zip(figure.subplots(1, len(shown)), shown, strict=True)):
+        seen, unseen = (report["cells"][cell] for cell in cells)
+        bars = [
+            ("seen", seen["network"][key], unit_colour(0)),
+            ("unseen", unseen["network"][key], unit_colour(1)),
+            ("ridge", unseen["ridge"][key], "0.7"),
+            ("constant", unseen["constant"][key], "0.85"),
+        ]
+        axes.bar([name for name, _, _ in bars], [value for _, value, _ in bars],
+                 color=[colour for _, _, colour in bars])  # fmt: skip
+        axes.tick_params(axis="x", rotation=60)
+        label(axes, "", "median error" if k == 0 else "", FIGURES[key])
+        grid(axes, "y")
+    told = "Presses that were not seen: on specimens that were, and on others; these two on others."
+    finish(figure, path, "One network for all specimens", told)
+
+
+def cells_table(reports: list[dict[str, Any]]) -> str:
+    """A row for each quantity; means over the seeds, their range, and the rivals."""
+    rows = []
+    for key, name in FIGURES.items():
+        cells = []
+        for cell in CELLS:
+            values = [report["cells"][cell]["network"][key] for report in reports]
+            spread = f" ({min(values):.3g}-{max(values):.3g})" if len(values) > 1 else ""
+            cells.append(f"{np.mean(values):.3g}{spread}")
+        last = reports[0]["cells"][list(CELLS)[-1]]
+        ratio = np.mean([report["ratio_unseen_to_seen_specimen"][key] for report in reports])
+        moved = max(last[f"network, all {offset}"][key] for offset in ("+0.05", "-0.05"))
+        rivals = [f"{last[rival][key]:.3g}" for rival in ("ridge", "constant")]
+        rows.append([name, *cells, f"{ratio:.2f}", f"{moved:.3g}", *rivals])
+    head = ["median error", *CELLS.values(), "ratio", "all electrodes off by 0.05", "ridge",
+            "constant"]  # fmt: skip
+    return markdown_table(head, rows)
+
+
+def page(found: dict[str, Any], networks: dict[str, list[dict[str, Any]]]) -> str:
+    """All of it."""
+    numbers, first = found["numbers"], next(iter(networks.values()))[0]
+    bands = [
+        [name, *(f"{value:.3g}" for value in values)] for name, values in found["bands"].items()
+    ]
+    counted = ", ".join(f"{name} {count:,}" for name, count in numbers["indenters"].items())
+    facts = "\n".join(
+        f"* {name}: {value:,.3f}" if isinstance(value, float) else f"* {name}: {value:,}"
+        for name, value in numbers.items()
+        if name != "indenters"
+    )
+    table = markdown_table(["of all rows, trials or presses", "5 %", "median", "95 %"], bands)
+    text = [HEAD, found["told"], "", facts, f"* presses by indenter: {counted}", ""]
+    text += ["![the set](population/set.png)", "", table]
+    unseen = len(first["unseen_specimens"])
+    text.append(
+        NETWORK.format(
+            **first["rows"],
+            specimens=first["specimens"],
+            presses=first["presses"],
+            unseen=unseen,
+        )
+    )
+    for name, reports in networks.items():
+        seeds = f"{len(reports)} seed{'s' * (len(reports) > 1)}."
+        text += [f"### {name}", "", seeds, "", cells_table(reports)]
+    return "\n".join([*text, "![network](population/network.png)", "", TOLD])
+
+
+HEAD = """# A population of simulated BioTacs
+
+Made by `python docs/make_population.py`, whose head names the commands before it. All of it is
+simulated: one skin and fill, indented by finite elements; specimens differ in their electrodes,
+fluid, core's place, noise and warmth ([priors](twin/units.md)).
+
+## The set
+"""
+
+NETWORK = """## One network for all specimens
+
+`palpate train population` ({all:,} rows of {presses:,} presses, {train:,} of them learned from). It
+reads the change of the logarithm of each impedance since rest, and is told the specimen by its
+untouched electrodes (FiLM). {unseen} of {specimens} specimens and a tenth of the presses are in no
+training. Rows of at least 0.5 N.
+
+*Ratio*: of a specimen that was not met to one that was, both on presses that were not met (goal
+1.2). The last three columns are of the cell where neither was seen: the network when all electrodes
+are off by 0.05 of a logarithm, as a fluid that has warmed since the tare (the worse of both signs),
+and rivals on the same inputs.
+"""
+
+TOLD = ""
+
+
+def main() -> None:
+    """Keep statistics or a report, or write the page."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--set", type=Path, nargs="+", help="mixed data sets of presses at random")
+    parser.add_argument("--seed", type=int, default=1, help="of the set")
+    parser.add_argument("--told", default="", help="what is to be said of the set")
+    parser.add_argument("--network", nargs=2, metavar=("NAME", "FOLDER"), help="a report to keep")
+    options = parser.parse_args()
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    if options.set:
+        found = statistics([read_mixed(path) for path in options.set], options.seed)
+        text = json.dumps({"told": options.told} | found, indent=1)
+        (FOLDER / SET).write_text(text + "\n", encoding="utf-8")
+        return
+    if options.network:
+        name, folder = options.network
+        shutil.copy(Path(folder) / "population.json", FOLDER / f"network-{name}.json")
+        return
+    found = json.loads((FOLDER / SET).read_text(encoding="utf-8"))
+    networks: dict[str, list[dict[str, Any]]] = {}
+    for path in sorted(FOLDER.glob("network-*.json")):
+        report = json.loads(path.read_text(encoding="utf-8"))
+        name = re.sub(r"-?seed\d+$", "", path.stem.removeprefix("network-"))
+        networks.setdefault(name, []).append(report)
+    draw_set(found, FOLDER / "set.png")
+    draw_networks({name: reports[0] for name, reports in networks.items()}, FOLDER / "network.png")
+    PAGE.write_text(page(found, networks).rstrip() + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,318 @@
+"""One network for a population: invented specimens whose electrodes differ by their gain."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from palpate.anatomy import ELECTRODE_MIRROR
+from palpate.errors import ConfigError, DatasetError
+from palpate_training.cli import train_app
+from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.features import FeatureDataset, write_dataset
+from palpate_training.evaluation.transfer import Finger, fingers_of, pretrained_from, summary
+from palpate_training.learning.electrode_nets import MIRROR_AXES
+from palpate_training.learning.networks import predict
+from palpate_training.learning.population_net import (
+    WEIGHTS,
+    CountsGraph,
+    PopulationConfig,
+    PopulationNet,
+    PopulationRows,
+    fit_population,
+    inputs_of,
+    load_population_net,
+    save_population_net,
+)
+from palpate_training.systems.transfer import WAYS, ForceTransfer, Way
+from palpate_training.tasks.population import (
+    REPORT,
+    points_of,
+    split_population,
+    targets_of,
+    train_population,
+)
+
+Floats = npt.NDArray[np.float64]
+
+SPECIMENS, PRESSES, ROWS = 16, 40, 8
+SMALL = PopulationConfig(
+    epochs=50,
+    batch_rows=64,
+    threads=1,
+    width=32,
+    blocks=1,
+    rest_width=16,
+    gain_sd=0.0,
+    rest_sd=0.02,
+)
+
+
+def pattern(force: Floats, place: Floats) -> Floats:
+    """Change of the logarithms of the impedance of a specimen of gain 1, (N, 19).
+
+    The mirror image of a force at the mirrored place gives the mirror image.
+    """
+    weight = np.random.default_rng(7).normal(0.0, 0.06, (2, 3, 19))
+    weight = 0.5 * (weight + MIRROR_AXES[:, None] * weight[:, :, ELECTRODE_MIRROR])
+    length = np.linalg.norm(force, axis=1, keepdims=True)
+    return np.asarray(force @ weight[0] + length * (200.0 * place @ weight[1]))
+
+
+def population() -> FeatureDataset:
+    """Each press on four specimens. A specimen's gain is told by its rest, and by that alone."""
+    rng = np.random.default_rng(0)
+    gain = np.exp(rng.normal(0.0, 0.4, SPECIMENS))
+    columns: dict[str, list[npt.NDArray[np.generic]]] = {
+        name: [] for name in ("electrodes", "baseline", "force", "group", "sensor", "location")
+    }
+    for press in range(PRESSES):
+        place = rng.uniform(-1.0, 1.0, 3) * np.array([6.0, 4.0, 2.0]) * 1e-3
+        most = rng.uniform(1.0, 5.0) * np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, 0.7, 3)
+        force = np.linspace(0.0, 1.0, ROWS)[:, None] * most
+        for specimen in rng.choice(SPECIMENS, 4, replace=False):
+            ratio = 0.5 * np.sqrt(gain[specimen]) * np.exp(rng.normal(0.0, 0.01, 19))
+            logs = gain[specimen] * pattern(force, place)
+            counts = np.rint(4095.0 / (1.0 + ratio * np.exp(logs)))
+            columns["electrodes"].append(counts.astype(np.uint16))
+            columns["baseline"].append(np.tile(4095.0 / (1.0 + ratio), (ROWS, 1)))
+            columns["force"].append(force)
+            columns["group"].append(np.full(ROWS, press))
+            columns["sensor"].append(np.full(ROWS, specimen))
+            columns["location"].append(np.tile(place, (ROWS, 1)))
+    joined = {name: np.concatenate(parts) for name, parts in columns.items()}
+    return FeatureDataset(
+        electrodes=joined["electrodes"].astype(np.uint16),
+        baseline=joined["baseline"].astype(np.float32),
+        force=joined["force"].astype(np.float32),
+        group=joined["group"].astype(np.int32),
+        block=joined["group"].astype(np.int32),
+        sensor=joined["sensor"].astype(np.int32),
+        sensor_names=tuple(f"unit-{number:03d}" for number in range(SPECIMENS)),
+        provenance=Provenance("invented", "", "", "", ""),
+        contact_location=joined["location"].astype(np.float32),
+        in_contact=np.linalg.norm(joined["force"], axis=1) > 0.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def data() -> FeatureDataset:
+    return population()
+
+
+@pytest.fixture(scope="module")
+def stored(data: FeatureDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("population") / "features.h5"
+    write_dataset(path, data)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(stored: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("trained")
+    train_population(stored, out, config=SMALL, device="cpu")
+    return out
+
+
+def test_learns_specimens_from_their_rest(folder: Path) -> None:
+    cells = json.loads((folder / REPORT).read_text())["cells"]
+    assert len(cells) == 4
+    for name, cell in cells.items():
+        mine, ridge = cell["network"]["force_magnitude_n"], cell["ridge"]["force_magnitude_n"]
+        assert mine < (0.8 if name.startswith("seen") else 1.0) * ridge, name
+        assert mine < 0.3 * cell["constant"]["force_magnitude_n"], name
+        low, high = cell["network"]["ci95"]["force_magnitude_n"]
+        assert low <= mine <= high
+
+
+def test_without_the_common_mode_an_offset_of_all_electrodes_changes_nothing(
+    data: FeatureDataset,
+) -> None:
+    inputs = inputs_of(data.electrodes, data.baseline)
+    moved = inputs.copy()
+    moved[:, :19] += np.float32(0.05)
+    for common, alike in ((0.0, True), (1.0, False)):
+        net = PopulationNet(("force",), replace(SMALL, common=common))
+        same = np.allclose(predict(net, moved), predict(net, inputs), atol=1e-5)
+        assert same is alike
+
+
+def test_no_specimen_and_no_point_is_on_two_sides(data: FeatureDataset) -> None:
+    twins = data.group // 2  # two presses of one point follow one another
+    at = np.zeros((len(data), 3), np.float32)
+    at[:, 0] = 0.01 * twins
+    paired = replace(data, contact_location=at)
+    split = split_population(paired, seed=3)
+    cells = split.cells
+    stopped = np.logical_or.reduce(split.validation)
+    for one in (split.train, stopped):
+        for other in ("seen_specimen_unseen_press", "unseen_specimen_unseen_press"):
+            assert not set(twins[one]) & set(twins[cells[other]])
+        for other in ("unseen_specimen_seen_press", "unseen_specimen_unseen_press"):
+            assert not set(data.sensor[one]) & set(data.sensor[cells[other]])
+    assert not set(twins[split.train]) & set(twins[stopped])
+    unseen = set(data.sensor[cells["unseen_specimen_seen_press"]])
+    assert {data.sensor_names[number] for number in unseen} <= set(split.specimens)
+
+
+def test_presses_without_location_are_points_of_their_own(data: FeatureDataset) -> None:
+    blind = replace(data, contact_location=None, in_contact=None)
+    assert len(np.unique(points_of(blind))) == PRESSES
+
+
+def test_a_mirrored_row_gets_the_mirrored_estimate(folder: Path, data: FeatureDataset) -> None:
+    net = load_population_net(folder / WEIGHTS)
+    rows = slice(0, 200)
+    plain = inputs_of(data.electrodes[rows], data.baseline[rows])
+    mirrored = inputs_of(
+        data.electrodes[rows][:, ELECTRODE_MIRROR], data.baseline[rows][:, ELECTRODE_MIRROR]
+    )
+    signs = np.tile(MIRROR_AXES, len(net.quantities))
+    np.testing.assert_allclose(predict(net, mirrored), predict(net, plain) * signs, atol=1e-5)
+    half = SMALL.width
+    with torch.inference_mode():
+        even, other = (net.hidden(torch.from_numpy(rows)).numpy() for rows in (plain, mirrored))
+    np.testing.assert_allclose(even[:, :half], other[:, :half], atol=1e-5)
+    np.testing.assert_allclose(even[:, half:], -other[:, half:], atol=1e-5)
+
+
+def test_saved_and_loaded_nets_agree(folder: Path, data: FeatureDataset, tmp_path: Path) -> None:
+    net = load_population_net(folder / WEIGHTS)
+    save_population_net(tmp_path / "again.npz", net)
+    again = load_population_net(tmp_path / "again.npz")
+    inputs = inputs_of(data.electrodes, data.baseline)
+    np.testing.assert_array_equal(predict(again, inputs), predict(net, inputs))
+    assert again.quantities == ("force", "contact_location")
+    counts = np.hstack([data.electrodes, data.baseline]).astype(np.float32)
+    with torch.inference_mode():
+        (shipped,) = (values.numpy() for values in CountsGraph(net)(torch.from_numpy(counts)))
+    np.testing.assert_allclose(shipped, predict(net, inputs), rtol=1e-3, atol=1e-3)
+
+
+def test_the_same_seed_gives_the_same_network(data: FeatureDataset) -> None:
+    names, targets = targets_of(data)
+    rows = PopulationRows(inputs_of(data.electrodes, data.baseline), targets)
+    first, second, other = (
+        fit_population(rows, [rows], names, config=replace(SMALL, epochs=1), seed=seed)
+        for seed in (5, 5, 6)
+    )
+    for name, values in first.state_dict().items():
+        assert torch.equal(values, second.state_dict()[name]), name
+    assert not torch.equal(first.layers.head.weight, other.layers.head.weight)
+
+
+def test_the_graph_is_as_exact_and_as_fast_as_a_bundle(folder: Path) -> None:
+    onnx = json.loads((folder / REPORT).read_text())["onnx"]
+    assert onnx["parity_max"] < 1e-5
+    assert onnx["milliseconds"] < 1.0
+
+
+def real(data: FeatureDataset, sensor: int) -> Finger:
+    """All rows of one specimen, as if it were a real finger."""
+    (finger,) = (one for one in fingers_of(data) if one.name == data.sensor_names[sensor])
+    return finger
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_network_helps_on_a_finger_that_was_never_met(
+    folder: Path, data: FeatureDataset, way: Way
+) -> None:
+    source, test = (real(data, sensor) for sensor in (1, 2))
+    net = pretrained_from(folder, way)
+    constant = np.tile(source.recording.force.mean(axis=0), (len(test.tared), 1))
+    estimate = ForceTransfer([source.recording], net).estimate(test.recording, unlabelled=False)
+    worst, mine = (summary(force, test.recording.force) for force in (constant, estimate))
+    assert mine["magnitude_median_n"] < 0.6 * worst["magnitude_median_n"]
+    alike = ForceTransfer([source.recording, source.recording.mirrored()], net)
+    here, there = (
+        alike.estimate(recording, unlabelled=False)
+        for recording in (test.recording, test.recording.mirrored())
+    )
+    np.testing.assert_allclose(there, here * MIRROR_AXES, atol=0.02)
+    if way == "alone":
+        single = net.fitted([source.recording])
+        np.testing.assert_array_equal(estimate, single.told(test.recording).prior)
+
+
+def test_the_command_takes_a_network_along(
+    folder: Path, data: FeatureDataset, tmp_path: Path
+) -> None:
+    arguments = ["transfer", "--pretrained", str(folder), "--way", "rest-of-it", "--json"]
+    for option, sensor in (("--train", 1), ("--test", 2)):
+        rows = np.tile(np.flatnonzero(data.sensor == sensor), 6)
+        none = np.zeros(len(rows), np.int32)
+        one = FeatureDataset(
+            electrodes=data.electrodes[rows],
+            baseline=data.baseline[rows],
+            force=data.force[rows],
+            group=none,
+            block=none,
+            sensor=none,
+            sensor_names=(f"finger-{sensor}",),
+            provenance=data.provenance,
+        )
+        write_dataset(tmp_path / f"{sensor}.h5", one)
+        arguments += [option, str(tmp_path / f"{sensor}.h5")]
+    result = CliRunner().invoke(train_app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0
+    found = json.loads(result.stdout)
+    assert found["pretrained"] == "rest-of-it"
+    assert found["magnitude_median_n"] < found["constant"]["magnitude_median_n"]
+
+
+def test_an_unknown_way_is_refused(folder: Path) -> None:
+    with pytest.raises(ConfigError, match="magic"):
+        pretrained_from(folder, "magic")
+
+
+def test_a_population_of_two_is_refused(data: FeatureDataset) -> None:
+    few = replace(data, sensor=np.minimum(data.sensor, 1))
+    with pytest.raises(DatasetError, match="2 specimens"):
+        split_population(few, seed=0)
+
+
+def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="palpate train population"):
+        load_population_net(tmp_path / WEIGHTS)
+    (tmp_path / WEIGHTS).write_bytes(b"no archive")
+    with pytest.raises(DatasetError, match="no network"):
+        load_population_net(tmp_path / WEIGHTS)
+    save_population_net(tmp_path / WEIGHTS, PopulationNet(("force",), SMALL))
+    with np.load(tmp_path / WEIGHTS) as file:
+        arrays = {name: file[name] for name in file.files}
+    arrays.pop("layers.head.weight")
+    np.savez(tmp_path / WEIGHTS, **arrays)
+    with pytest.raises(DatasetError, match="no network"):
+        load_population_net(tmp_path / WEIGHTS)
+
+
+def test_a_gpu_that_is_not_there_is_said(
+    stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="no GPU"):
+        train_population(stored, tmp_path, config=SMALL, device="cuda")
+    with pytest.raises(ConfigError, match="tpu"):
+        train_population(stored, tmp_path, config=SMALL, device="tpu")
+
+
+def test_targets_are_unknown_without_contact(data: FeatureDataset) -> None:
+    names, targets = targets_of(data)
+    assert names == ("force", "contact_location")
+    assert data.in_contact is not None
+    np.testing.assert_array_equal(np.isnan(targets[:, 3]), ~data.in_contact)
+
+
+def test_the_command_writes_report_and_weights(stored: Path, tmp_path: Path) -> None:
+    arguments = ["population", str(stored), str(tmp_path), "--epochs", "1", "--width", "16"]
+    result = CliRunner().invoke(train_app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "unseen specimen unseen press" in result.output
+    assert load_population_net(tmp_path / WEIGHTS).config.width == 16

@@ -1,0 +1,383 @@
+"""One network for a population of specimens, measured on specimens and presses it has not met.
+
+Specimens are dealt to those that are learned from, those that the training stops on, and those that
+are unseen; points of the skin likewise, with all presses there. Reported are four cells: seen and
+unseen specimens by seen and unseen presses; beside a constant and a ridge regression on the same
+inputs; and the unseen cell again with all electrodes off by the same, as a fluid that has warmed
+since the tare.
+
+    palpate train population features.h5 runs/population
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from palpate.errors import ConfigError, DatasetError
+from palpate.files.atomic import written_whole
+from palpate_training.datasets.features import (
+    ELECTRODES,
+    OF_CONTACT,
+    FeatureDataset,
+    open_dataset,
+)
+from palpate_training.learning import baselines
+from palpate_training.learning.metrics import (
+    FORCE_BINS_N,
+    angles,
+    drawn_medians,
+    force_errors,
+    interval,
+    location_errors,
+)
+from palpate_training.learning.networks import predict
+from palpate_training.learning.population_net import (
+    INPUTS,
+    WEIGHTS,
+    CountsGraph,
+    PopulationConfig,
+    PopulationNet,
+    PopulationRows,
+    fit_population,
+    inputs_of,
+    save_population_net,
+)
+
+FloatArray = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+Estimate = Callable[[FloatArray], npt.NDArray[np.floating]]
+
+REPORT = "population.json"
+ONNX = "population.onnx"
+
+UNSEEN_SPECIMENS = 0.15
+STOPPED_SPECIMENS = 0.05
+UNSEEN_POINTS = 0.1
+STOPPED_POINTS = 0.05
+
+SAME_POINT_M = 3e-3
+"""Presses that follow one another and touch within this are taken for presses of one point: of the
+twin's 36 pairs of presses that are, 34 do."""
+
+COMMON_OFFSETS = (0.05, -0.05)
+"""Logarithms of the impedance by which all electrodes are off in the stressed cells."""
+
+TOUCHED_N = 0.5
+"""Rows of a cell have at least this force, as the paper's [N]."""
+
+ROWS_MOST = 60_000
+"""Rows of a cell, evenly over it; more would only cost time."""
+
+DRAWS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class PopulationSplit:
+    """Which rows are on which side.
+
+    Attributes:
+        train: Rows to learn from.
+        validation: Sets of rows to stop on: specimens that are learned from, and others.
+        cells: Rows of each cell that is reported, by name.
+        specimens: Names of the unseen specimens.
+    """
+
+    train: Mask
+    validation: tuple[Mask, ...]
+    cells: dict[str, Mask]
+    specimens: tuple[str, ...]
+
+
+def split_population(data: FeatureDataset, *, seed: int) -> PopulationSplit:
+    """Deal specimens and points.
+
+    Raises:
+        DatasetError: There are fewer than three specimens or points, or a side has no rows.
+    """
+    rng = np.random.default_rng(seed)
+    specimen = _dealt(rng, data.sensor, UNSEEN_SPECIMENS, STOPPED_SPECIMENS, "specimens")
+    press = _dealt(rng, points_of(data), UNSEEN_POINTS, STOPPED_POINTS, "points")
+    train = (specimen == _LEARNED) & (press == _LEARNED)
+    validation = tuple((specimen == side) & (press == _STOPPED) for side in (_LEARNED, _STOPPED))
+    cells = {
+        f"{name}_specimen_{what}_press": (specimen == one) & (press == other)
+        for name, one in (("seen", _LEARNED), ("unseen", _UNSEEN))
+        for what, other in (("seen", _LEARNED), ("unseen", _UNSEEN))
+    }
+    touched = np.linalg.norm(data.force, axis=1) >= TOUCHED_N
+    sides = {"train": train, "validation": validation[0], **cells}
+    for name, rows in sides.items():
+        if not (rows & touched).any():
+            raise DatasetError(
+                f"{data.name}: {name} has no row of at least {TOUCHED_N:g} N",
+                remedy="use a data set with more presses of more specimens, or another seed",
+            )
+    return PopulationSplit(
+        train,
+        tuple(rows for rows in validation if (rows & touched).any()),
+        cells,
+        tuple(data.sensor_names[i] for i in np.unique(data.sensor[specimen == _UNSEEN])),
+    )
+
+
+_LEARNED, _STOPPED, _UNSEEN = range(3)
+
+
+def _dealt(
+    rng: np.random.Generator,
+    label: npt.NDArray[np.integer],
+    unseen_share: float,
+    stopped_share: float,
+    what: str,
+) -> npt.NDArray[np.int64]:
+    """Side of every row, so that rows of one label are on one side."""
+    names, number = np.unique(label, return_inverse=True)
+    if len(names) < 3:
+        raise DatasetError(
+            f"{len(names)} {what} cannot be dealt to training, validation and test",
+            remedy="use a data set of a population: `palpate fem units draw`",
+        )
+    side = np.full(len(names), _LEARNED)
+    dealt = rng.permutation(len(names))
+    unseen = max(1, round(unseen_share * len(names)))
+    stopped = max(1, round(stopped_share * len(names)))
+    side[dealt[:unseen]] = _UNSEEN
+    side[dealt[unseen : unseen + stopped]] = _STOPPED
+    return side[number]
+
+
+def points_of(data: FeatureDataset) -> npt.NDArray[np.int64]:
+    """Point of the skin that each row belongs to, shape ``(N,)``.
+
+    A features file does not name points, but has the presses of one point after one another. So
+    groups that follow one another and touch nearly the same place count as one point: now and then
+    two that are not, which does no harm. Where no contact is known every group is a point.
+    """
+    groups, number = np.unique(data.group, return_inverse=True)
+    where = np.full((len(groups), 3), np.nan)
+    if data.contact_location is not None:
+        known = np.flatnonzero(np.isfinite(data.contact_location).all(axis=1))
+        first_known, rows = np.unique(number[known], return_index=True)
+        where[first_known] = data.contact_location[known[rows]]
+    apart = np.linalg.norm(np.diff(where, axis=0), axis=1)
+    other = ~(apart <= SAME_POINT_M)  # not known is another one
+    point: npt.NDArray[np.int64] = np.concatenate([[0], np.cumsum(other)])[number]
+    return point
+
+
+def train_population(
+    path: Path,
+    out: Path,
+    *,
+    config: PopulationConfig,
+    device: str = "auto",
+    seed: int = 0,
+    on_epoch: Callable[[], None] | None = None,
+) -> tuple[PopulationNet, dict[str, Any]]:
+    """Train, measure, and write weights and report into a folder.
+
+    Args:
+        path: Features file of a population.
+        out: Folder; what an earlier run left there is replaced.
+        config: Settings.
+        device: Where it is trained: cpu, cuda, or auto = on a GPU if there is one.
+        seed: Of split, weights, order of the rows and noise.
+        on_epoch: Called after each epoch, for a progress bar.
+
+    Returns:
+        The network, and what the report holds.
+
+    Raises:
+        ConfigError: There is no GPU, but one is wanted.
+        DatasetError: The data breaks its schema, is no population, or the disk refused.
+    """
+    where = _device(device)
+    data = open_dataset(path)
+    inputs = inputs_of(data.electrodes, data.baseline)
+    quantities, targets = targets_of(data)
+    split = split_population(data, seed=seed)
+    begun = time.monotonic()
+    with torch.device(where):
+        if where == "cuda":
+            torch.set_float32_matmul_precision("high")
+        net = fit_population(
+            PopulationRows(inputs[split.train], targets[split.train]),
+            [PopulationRows(inputs[rows], targets[rows]) for rows in split.validation],
+            quantities,
+            config=config,
+            seed=seed,
+            on_epoch=on_epoch,
+        )
+    trained_s = time.monotonic() - begun
+    save_population_net(out / WEIGHTS, net)
+    rivals = _rivals(net, inputs, targets, split)
+    cells = {
+        name: _cell(rows, inputs, targets, data.group, net, rivals)
+        for name, rows in split.cells.items()
+    }
+    facts: dict[str, Any] = {
+        "data": data.provenance.source,
+        "data_sha256": data.content_sha256(),
+        "rows": {"all": len(data), "train": int(split.train.sum())},
+        "presses": len(np.unique(data.group)),
+        "points": len(np.unique(points_of(data))),
+        "specimens": len(data.sensor_names),
+        "unseen_specimens": split.specimens,
+        "quantities": quantities,
+        "config": asdict(config),
+        "seed": seed,
+        "device": where,
+        "trained_s": round(trained_s, 1),
+        "cells": cells,
+        "ratio_unseen_to_seen_specimen": {
+            key: value / cells["seen_specimen_unseen_press"]["network"][key]
+            for key, value in cells["unseen_specimen_unseen_press"]["network"].items()
+            if isinstance(value, float)
+        },
+    }
+    facts["onnx"] = _export(out / ONNX, net, data, split.cells["unseen_specimen_unseen_press"])
+    with written_whole(out / REPORT) as part:
+        part.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    return net, facts
+
+
+def _device(wanted: str) -> str:
+    if wanted not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"no device {wanted!r}", remedy="choose auto, cpu or cuda")
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("torch sees no GPU", remedy="give --device cpu, or auto")
+    return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
+
+
+def targets_of(data: FeatureDataset) -> tuple[tuple[str, ...], FloatArray]:
+    """Names of what a data set knows, and these values, shape ``(N, 3 Q)``; force first."""
+    known = data.arrays()
+    names = ("force", *(name for name in OF_CONTACT if name in known))
+    values = np.hstack([np.asarray(known[name], np.float32) for name in names])
+    if data.in_contact is not None:
+        values[~data.in_contact, 3:] = np.nan
+    return names, values
+
+
+def _rivals(
+    net: PopulationNet, inputs: FloatArray, targets: FloatArray, split: PopulationSplit
+) -> dict[str, Estimate]:
+    """Constant and ridge regression on what the network reads; one for each quantity."""
+
+    def read(rows: FloatArray) -> FloatArray:
+        with torch.inference_mode():
+            return np.asarray(net.read(torch.from_numpy(rows)).numpy())
+
+    chosen = np.logical_or.reduce(split.validation)
+    fitted: dict[str, list[baselines.AffineModel]] = {"constant": [], "ridge": []}
+    for part in np.split(targets, targets.shape[1] // 3, axis=1):
+        known = np.isfinite(part).all(axis=1)
+        rows, ends = split.train & known, chosen & known
+        x, y = read(inputs[rows]), part[rows]
+        fitted["constant"].append(baselines.constant(x, y))
+        ends = ends if ends.any() else rows
+        fitted["ridge"].append(baselines.ridge(x, y, read(inputs[ends]), part[ends]))
+
+    def estimate(models: list[baselines.AffineModel]) -> Estimate:
+        return lambda rows: np.hstack([model.predict(read(rows)) for model in models])
+
+    return {name: estimate(models) for name, models in fitted.items()}
+
+
+def _cell(
+    rows: Mask,
+    inputs: FloatArray,
+    targets: FloatArray,
+    group: npt.NDArray[np.integer],
+    net: PopulationNet,
+    rivals: dict[str, Estimate],
+) -> dict[str, Any]:
+    """Errors of network and rivals in one cell, and of the network with all electrodes off."""
+    touched = rows & (np.linalg.norm(targets[:, :3], axis=1) >= TOUCHED_N)
+    some = np.flatnonzero(touched)
+    some = some[np.unique(np.linspace(0, len(some) - 1, ROWS_MOST).astype(int))]
+    x, truth, press = inputs[some], targets[some], group[some]
+
+    def network(values: FloatArray) -> FloatArray:
+        return predict(net, values)
+
+    names = net.quantities
+    found: dict[str, Any] = {"rows": len(some), "presses": len(np.unique(press))}
+    found["network"] = _figures(names, network(x), truth, press, ends=True)
+    for name, rival in rivals.items():
+        found[name] = _figures(names, rival(x), truth, press)
+    for offset in COMMON_OFFSETS:
+        moved = x.copy()
+        moved[:, :ELECTRODES] += np.float32(offset)
+        found[f"network, all {offset:+g}"] = _figures(names, network(moved), truth, press)
+    still = np.flatnonzero(rows & (np.linalg.norm(targets[:, :3], axis=1) == 0.0))[:ROWS_MOST]
+    if len(still):
+        lengths = np.linalg.norm(network(inputs[still])[:, :3], axis=1)
+        found["untouched_median_n"] = float(np.median(lengths))
+    return found
+
+
+def _figures(
+    names: tuple[str, ...],
+    estimate: npt.NDArray[np.floating],
+    truth: FloatArray,
+    press: npt.NDArray[np.integer],
+    *,
+    ends: bool = False,
+) -> dict[str, Any]:
+    """Medians of the errors, and with ``ends`` their 95 % intervals by press."""
+    errors: dict[str, npt.NDArray[np.float64]] = {}
+    for number, name in enumerate(names):
+        guess, right = (values[:, 3 * number : 3 * number + 3] for values in (estimate, truth))
+        if name == "force":
+            of_force = force_errors(guess, right)
+            hard = np.linalg.norm(right, axis=1) >= FORCE_BINS_N["2_to_8n"][0]
+            errors["force_magnitude_n"] = of_force["magnitude_n"]
+            relative = 100.0 * of_force["magnitude_over_norm"]
+            errors["force_from_2n_percent"] = np.where(hard, relative, np.nan)
+            errors["force_angle_rad"] = of_force["angle_rad"]
+        elif name == "contact_normal":
+            unknown = np.isnan(right).any(axis=1)
+            angle = angles(guess, np.nan_to_num(right))
+            errors["normal_angle_rad"] = np.where(unknown, np.nan, angle)
+        else:
+            errors[f"{name}_mm"] = 1e3 * location_errors(guess, right)["distance_m"]
+    known = {key: values for key, values in errors.items() if np.isfinite(values).any()}
+    figures: dict[str, Any] = {key: float(np.nanmedian(one)) for key, one in known.items()}
+    if ends:
+        figures["ci95"] = {
+            key: interval(drawn_medians([one], press, draws=DRAWS)) for key, one in known.items()
+        }
+    return figures
+
+
+def _export(path: Path, net: PopulationNet, data: FeatureDataset, rows: Mask) -> dict[str, Any]:
+    """Write the network as ONNX, if that can be done here; what came of it."""
+    try:
+        # A machine that trains need not have what a bundle takes.
+        from palpate_training.learning.export import check_parity, frame_s, onnx_bytes
+    except ImportError as error:
+        return {"left out": str(error)}
+    some = np.flatnonzero(rows)
+    some = some[np.unique(np.linspace(0, len(some) - 1, 256).astype(int))]
+    counts = np.hstack([data.electrodes[some], data.baseline[some]]).astype(np.float32)
+    graph, scale = CountsGraph(net).eval(), net.output_sd.numpy()
+    try:
+        model = onnx_bytes(graph, "counts", torch.zeros(4, INPUTS), ["estimates"])
+        parity = check_parity(
+            graph, model, "counts", ["estimates"], counts, lambda _i, _right: scale
+        )
+    except ImportError as error:
+        return {"left out": str(error)}
+    with written_whole(path) as part:
+        part.write_bytes(model)
+    return {"parity_max": parity, "milliseconds": 1e3 * frame_s(model, "counts", counts[:1])}
