@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import re
 import shutil
 from collections import Counter
@@ -34,7 +35,7 @@ from palpate_training.figures.style import (
     unit_colour,
 )
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "results" / "population"
@@ -67,23 +68,24 @@ def statistics(parts: list[MixedDataset], seed: int) -> dict[str, Any]:
     for data in parts:
         names |= set(data.experiment.trajectories)
         trials += data.experiment.trials
-        for name, values in columns(data).items():
-            rows.setdefault(name, []).append(values)
+        for name, column in columns(data).items():
+            rows.setdefault(name, []).append(column)
     values = {name: np.concatenate(some) for name, some in rows.items()}
-    planned = {key: [] for key in ("tilt", "depth", "slide", "twist")}
+    planned: dict[str, list[float]] = {key: [] for key in ("tilt", "depth", "slide", "twist")}
     for name in sorted(names):
         first, *move = segments_of(seed, number_of(name))
-        planned["tilt"].append(np.degrees(first.angle_rad))
+        planned["tilt"].append(math.degrees(first.angle_rad))
         planned["depth"].append(1e3 * (first.amount or 0.0))
         for one in move:
             amount = abs(one.amount or 0.0)
-            planned[one.kind].append(1e3 * amount if one.kind == "slide" else np.degrees(amount))
-    bands = {
+            planned[one.kind].append(1e3 * amount if one.kind == "slide" else math.degrees(amount))
+    bands: dict[str, Any] = {
         "tilt [deg]": planned["tilt"],
         "depth [mm]": planned["depth"],
         "slide, of those that do [mm]": planned["slide"],
         "twist, of those that do [deg]": planned["twist"],
-    } | values
+        **values,
+    }
     return {
         "numbers": {
             "presses with rows": len(names),
