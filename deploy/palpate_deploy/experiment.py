@@ -268,6 +268,8 @@ class FemSimulator:
             ConfigError: There is no such device.
         """
         setup = WorkerSetup(DEFAULT_FACTORY, _mesh_options(spec), parameters_of(spec), 1)
+        # Of very many presses at random a few may be shorter than they could be.
+        gives_up = spec.presses > 0
         batch: SimulationBatch | DeviceBatch | RayBatch
         if cluster is not None:
             packers = cluster_packers()
@@ -278,6 +280,7 @@ class FemSimulator:
                 slots=slots or SLOTS,
                 limit_s=LIMIT_S,
                 indenters=_indenters(spec),
+                gives_up=gives_up,
             )
         elif devices:
             check_devices(devices)
@@ -289,6 +292,7 @@ class FemSimulator:
                 threads=threads,
                 limit_s=LIMIT_S,
                 indenters=_indenters(spec),
+                gives_up=gives_up,
             )
         else:
             packers = 0

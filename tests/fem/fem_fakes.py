@@ -20,6 +20,7 @@ import numpy as np
 
 from palpate.errors import SimulationError
 from palpate_fem.arrays import Floats
+from palpate_fem.batched.fingertip import UnsolvedPress
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
@@ -222,7 +223,10 @@ class FakeSolver:
                 odd = self.kind in (UNSOLVED, APART) and len(press.path) % 2 == 0
                 if odd and len(steps) == 2:
                     del live[number]
-                    yield number, press
+                    name = self.indenters[press.indenter]
+                    end = IndentationOutcome.DIVERGED, "no equilibrium", 1e-3, 0.1
+                    result = IndentationResult(name, press.path, tuple(steps), *end)
+                    yield number, UnsolvedPress(press, result)
                     continue
                 try:
                     step = next(run)

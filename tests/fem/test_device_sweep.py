@@ -176,6 +176,15 @@ def test_what_devices_do_not_solve_the_cpu_does(
     assert len(kept) == 7
 
 
+def test_what_devices_do_not_solve_may_end_there() -> None:
+    """With the steps that were found, and without a worker."""
+    report, kept = run(batch_of(fakes.UNSOLVED, devices=2, gives_up=True), [*hard(3), *short(4)])
+    assert dict(report.outcomes) == {"complete": 4, "diverged": 3}
+    assert report.on_cpu == 0
+    assert [len(kept[f"hard/{k}"].steps) for k in range(3)] == [2, 2, 2]
+    assert [early.reason for early in report.early] == ["no equilibrium"] * 3
+
+
 @pytest.mark.parametrize(
     ("broken", "said"), [("no such mesh", "no such mesh"), ("dies", "exit status 9")]
 )

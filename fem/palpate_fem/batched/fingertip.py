@@ -56,6 +56,19 @@ class BatchedPress:
     path: Floats
 
 
+@dataclass(frozen=True, slots=True)
+class UnsolvedPress:
+    """A trajectory that finds no equilibrium on the device, where it may have one on the CPU.
+
+    Attributes:
+        press: The trajectory.
+        result: As far as it went.
+    """
+
+    press: BatchedPress
+    result: IndentationResult
+
+
 @dataclass(slots=True)
 class _Live:
     """The trajectory in a slot, and what it asks for."""
@@ -140,8 +153,8 @@ class BatchedFingertip:
         unsolved: list[tuple[int, BatchedPress]] = []
         found = self.solve(presses, on_sweep=on_sweep, on_step=on_step, should_stop=should_stop)
         for number, result in found:
-            if isinstance(result, BatchedPress):
-                unsolved.append((number, result))
+            if isinstance(result, UnsolvedPress):
+                unsolved.append((number, result.press))
             else:
                 yield number, result
         for number, press in unsolved:
@@ -155,7 +168,7 @@ class BatchedFingertip:
         on_sweep: Callable[[int], None] | None = None,
         on_step: Callable[[int, IndentationStep], None] | None = None,
         should_stop: Callable[[int], IndentationOutcome | None] | None = None,
-    ) -> Iterator[tuple[int, IndentationResult | BatchedPress]]:
+    ) -> Iterator[tuple[int, IndentationResult | UnsolvedPress]]:
         """Compute on the device what can be computed there.
 
         Args:
@@ -168,8 +181,7 @@ class BatchedFingertip:
                 ends it.
 
         Yields:
-            Number of the trajectory, in the order in which they were taken, and its result; the
-            press itself if it finds no equilibrium on the device.
+            Number of the trajectory, in the order in which they were taken, and its result.
 
         Raises:
             ConfigError: A press names no indenter, or its path is not valid, see `check_path`.
@@ -193,8 +205,9 @@ class BatchedFingertip:
             self._step(live)
             for slot in [slot for slot, one in live.items() if one.wanted is None]:
                 one = live.pop(slot)
-                unsolved = one.trajectory.unsolved
-                yield one.number, one.press if unsolved else self._result(one)
+                result = self._result(one)
+                solved = not one.trajectory.unsolved
+                yield one.number, result if solved else UnsolvedPress(one.press, result)
 
     def _fill(self, live: dict[int, _Live], waiting: Iterator[tuple[int, BatchedPress]]) -> None:
         """Give free slots their next trajectories."""

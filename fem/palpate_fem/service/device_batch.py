@@ -371,6 +371,8 @@ class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
         hang_s: A process that should be at work and is silent for so long is ended [s].
         start_s: The same before its device is ready [s].
         indenters: Names of all that trajectories may have.
+        gives_up: Whether a trajectory that has no equilibrium on a device ends there; else the CPU
+            begins it anew, which copes with indefinite tangents.
 
     Raises:
         ConfigError: There are no devices or no slots.
@@ -387,6 +389,7 @@ class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
         hang_s: float = HANG_S,
         start_s: float = START_S,
         indenters: tuple[str, ...] = indenter_names(),
+        gives_up: bool = False,
     ) -> None:
         if not devices:
             raise ConfigError("no devices", remedy="give one or more")
@@ -398,7 +401,7 @@ class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
         self.ahead = SLOTFULS * slots * len(devices) + ON_CPU_MOST
         self._setup, self._threads = setup, threads
         self._hang_s, self._start_s = hang_s, start_s
-        self._indenters = indenters
+        self._indenters, self._gives_up = indenters, gives_up
         self._again = False  # whether the last one was started once more
         for device in devices:
             self._start(device)
@@ -409,7 +412,9 @@ class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
         return [process.pid for process in self._devices]
 
     def _start(self, device: str) -> None:
-        setup = DeviceSetup(self._setup, device, self._slots, self._indenters)
+        setup = DeviceSetup(
+            self._setup, device, self._slots, self._indenters, gives_up=self._gives_up
+        )
         self._devices.append(
             DeviceProcess(
                 setup,

@@ -128,9 +128,11 @@ class DeviceWorker:
                 number = at_work.pop(order).number
                 self._cancelled.discard(number)
                 if not isinstance(result, IndentationResult):
-                    self._outbox.put(PressUnsolved(number))
-                else:
-                    self._give(number, replace(result, steps=()) if setup.streams else result)
+                    if not setup.gives_up:
+                        self._outbox.put(PressUnsolved(number))
+                        continue
+                    result = result.result
+                self._give(number, replace(result, steps=()) if setup.streams else result)
         except Exception as error:
             self._outbox.put(JobFailed.of(error))
             self._outbox.close()

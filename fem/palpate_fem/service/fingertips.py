@@ -21,7 +21,7 @@ from palpate_fem.result import IndentationOutcome, IndentationResult, Indentatio
 from palpate_fem.store.content import StoredFingertip
 
 if TYPE_CHECKING:  # workers on the CPU do without it
-    from palpate_fem.batched.fingertip import BatchedPress
+    from palpate_fem.batched.fingertip import BatchedPress, UnsolvedPress
 
 OnFraction = Callable[[float], None]
 """Called with the completed fraction of the pressurisation; an exception from it ends that."""
@@ -57,7 +57,7 @@ class SlottedSolver(Protocol):
         on_sweep: Callable[[int], None] | None = None,
         on_step: Callable[[int, IndentationStep], None] | None = None,
         should_stop: Callable[[int], IndentationOutcome | None] | None = None,
-    ) -> Iterator[tuple[int, IndentationResult | BatchedPress]]:
+    ) -> Iterator[tuple[int, IndentationResult | UnsolvedPress]]:
         """Solve presses, in whatever order they end; see ``BatchedFingertip.solve``."""
         ...
 

@@ -152,6 +152,8 @@ class DeviceSetup:
         slots: Trajectories at once.
         indenters: Names of all that presses may have.
         streams: Whether each step is sent as it is made; results then come without steps.
+        gives_up: Whether a trajectory that has no equilibrium on the device ends there; else it is
+            reported as not solved.
     """
 
     worker: WorkerSetup
@@ -159,6 +161,7 @@ class DeviceSetup:
     slots: int
     indenters: tuple[str, ...]
     streams: bool = False
+    gives_up: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -193,6 +193,7 @@ class RayBatch(SlottedBatch[RayDevice]):
         wait_s: Longest time without any machine [s].
         look_s: Time between two looks for machines [s].
         indenters: Names of all that trajectories may have.
+        gives_up: See `DeviceBatch`.
 
     Raises:
         ConfigError: The cluster has no GPUs, or there are no slots.
@@ -212,11 +213,18 @@ class RayBatch(SlottedBatch[RayDevice]):
         wait_s: float = WAIT_S,
         look_s: float = LOOK_S,
         indenters: tuple[str, ...] = indenter_names(),
+        gives_up: bool = False,
     ) -> None:
         self._share = RayShare(cluster, setup, limit_s)
         super().__init__(slots, self._share)
         self._cluster, self._device = cluster, device
-        self._setup = DeviceSetup(setup, "cuda:0" if device == "cuda" else "cpu", slots, indenters)
+        self._setup = DeviceSetup(
+            setup,
+            "cuda:0" if device == "cuda" else "cpu",
+            slots,
+            indenters,
+            gives_up=gives_up,
+        )
         self._hang_s, self._start_s = hang_s, start_s
         self._silent_s, self._wait_s, self._look_s = silent_s, wait_s, look_s
         self._has_devices = device is not None
