@@ -16,7 +16,6 @@ import argparse
 import json
 import math
 import re
-import shutil
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -179,7 +178,7 @@ def draw_set(found: dict[str, Any], path: Path) -> None:
 
 def draw_networks(networks: dict[str, dict[str, Any]], path: Path) -> None:
     """Errors on presses that were not seen, beside those of ridge and constant."""
-    figure = new_figure(9.5, 3.0)
+    figure = new_figure(11.0, 3.0)
     shown = [key for key in FIGURES if key != "force_angle_rad"]
     report = networks[next(iter(networks))]
     cells = list(CELLS)[1::2]
@@ -196,7 +195,10 @@ def draw_networks(networks: dict[str, dict[str, Any]], path: Path) -> None:
         axes.tick_params(axis="x", rotation=60)
         label(axes, "", "median error" if k == 0 else "", FIGURES[key])
         grid(axes, "y")
-    told = "Presses that were not seen: on specimens that were, and on others; these two on others."
+    told = (
+        "On presses that were not seen: of a specimen that was, and of one that was not; ridge and "
+        "constant on the latter."
+    )
     finish(figure, path, "One network for all specimens", told)
 
 
@@ -219,12 +221,15 @@ def cells_table(reports: list[dict[str, Any]]) -> str:
     return markdown_table(head, rows)
 
 
+def show(value: float) -> str:
+    """A number of a band."""
+    return f"{value:,.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+
+
 def page(found: dict[str, Any], networks: dict[str, list[dict[str, Any]]]) -> str:
     """All of it."""
     numbers, first = found["numbers"], next(iter(networks.values()))[0]
-    bands = [
-        [name, *(f"{value:.3g}" for value in values)] for name, values in found["bands"].items()
-    ]
+    bands = [[name, *(show(value) for value in values)] for name, values in found["bands"].items()]
     counted = ", ".join(f"{name} {count:,}" for name, count in numbers["indenters"].items())
     facts = "\n".join(
         f"* {name}: {value:,.3f}" if isinstance(value, float) else f"* {name}: {value:,}"
@@ -271,7 +276,21 @@ are off by 0.05 of a logarithm, as a fluid that has warmed since the tare (the w
 and rivals on the same inputs.
 """
 
-TOLD = ""
+TOLD = """## What it says
+
+* **Where a specimen was met, presses limit; where it was not, specimens do.** More passes and less
+  noise in training take the error from 2 N on presses that were learned from to 12 %, on others to
+  29 %, on other specimens to no less than 42 % ([LOG](../../training/LOG.md)). Eighty specimens to
+  learn from are too few: on a specimen that was not met, forces are too small or too large by one
+  factor (standard deviation of its logarithm 0.55 over the fifteen), which goes with how high its
+  core sits (rank correlation -0.8) and how thick its unloaded film is (-0.7). The first is in the
+  electrodes at rest, the second is not: that takes a press.
+* **A common offset does no harm**: 0.05 of a logarithm on all electrodes changes no median by 2 %.
+* **Centre of pressure and contact normal** are what an unknown finger can be asked for: 0.6 mm and
+  2.6 degrees, of 5 mm and 24 degrees for a constant.
+* **On real fingers it does not help yet**: no way of using it is better than none on both fingers
+  of `palpate train transfer` (LOG).
+"""
 
 
 def main() -> None:
@@ -290,14 +309,16 @@ def main() -> None:
         return
     if options.network:
         name, folder = options.network
-        shutil.copy(Path(folder) / "population.json", FOLDER / f"network-{name}.json")
+        report = json.loads((Path(folder) / "population.json").read_text(encoding="utf-8"))
+        slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+        path = FOLDER / f"network-{slug}-seed{report['seed']}.json"
+        path.write_text(json.dumps({"name": name} | report, indent=1) + "\n", encoding="utf-8")
         return
     found = json.loads((FOLDER / SET).read_text(encoding="utf-8"))
     networks: dict[str, list[dict[str, Any]]] = {}
     for path in sorted(FOLDER.glob("network-*.json")):
         report = json.loads(path.read_text(encoding="utf-8"))
-        name = re.sub(r"-?seed\d+$", "", path.stem.removeprefix("network-"))
-        networks.setdefault(name, []).append(report)
+        networks.setdefault(report["name"], []).append(report)
     draw_set(found, FOLDER / "set.png")
     draw_networks({name: reports[0] for name, reports in networks.items()}, FOLDER / "network.png")
     PAGE.write_text(page(found, networks).rstrip() + "\n", encoding="utf-8")
