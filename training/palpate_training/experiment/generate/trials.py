@@ -7,6 +7,8 @@ what is expensive to make (the specimens' electrodes) between tasks.
 from __future__ import annotations
 
 import io
+import pickle
+import tempfile
 import threading
 import zipfile
 import zlib
@@ -91,15 +93,20 @@ def make_trials(
     if not left:
         return True
     make = simulator.make_specimens(fingertip, specimens)
-    work: Callable[[TrialTask], bytes] = partial(_work, make)
     tasks = _tasks(spec, store, specimens, left, simulator, in_worker=runner.sees_files)
-    for task, data in runner.run(work, tasks):
-        with written_whole(file_of(folder, task.name)) as part:
-            part.write_bytes(data)
-        done += 1
-        on_progress(done, len(plans), task.name)
-        if stop.is_set():
-            break
+    with tempfile.NamedTemporaryFile(prefix="palpate-specimens-") as shared:
+        work: Callable[[TrialTask], bytes] = partial(_work, make)
+        if runner.sees_files:  # the skin and a thousand specimens are more than a task
+            shared.write(pickle.dumps(make))
+            shared.flush()
+            work = partial(_work_shared, Path(shared.name))
+        for task, data in runner.run(work, tasks):
+            with written_whole(file_of(folder, task.name)) as part:
+                part.write_bytes(data)
+            done += 1
+            on_progress(done, len(plans), task.name)
+            if stop.is_set():
+                break
     return done == len(plans)
 
 
@@ -379,3 +386,13 @@ def _pressed(make: MakeSpecimens) -> PressedSpecimens:
 
 def _work(make: MakeSpecimens, task: TrialTask) -> bytes:
     return pack(execute(_pressed(make), task))
+
+
+@lru_cache(maxsize=1)
+def _shared(path: Path) -> PressedSpecimens:
+    make: MakeSpecimens = pickle.loads(path.read_bytes())
+    return make()
+
+
+def _work_shared(path: Path, task: TrialTask) -> bytes:
+    return pack(execute(_shared(path), task))
