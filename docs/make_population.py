@@ -285,9 +285,9 @@ TOLD = """## What it says
   factor (standard deviation of its logarithm 0.55 over the fifteen), which goes with how high its
   core sits (rank correlation -0.8) and how thick its unloaded film is (-0.7). The first is in the
   electrodes at rest, the second is not: that takes a press.
-* **A common offset does no harm**: 0.05 of a logarithm on all electrodes changes no median by 2 %.
-* **Centre of pressure and contact normal** are what an unknown finger can be asked for: 0.6 mm and
-  2.6 degrees, of 5 mm and 24 degrees for a constant.
+* **A common offset does no harm**: 0.05 of a logarithm on all electrodes changes no median by 3 %.
+* **Centre of pressure and contact normal** are what an unknown finger can be asked for: 0.5 mm and
+  2.2 degrees, of 5 mm and 24 degrees for a constant.
 * **On real fingers it does not help yet**: no way of using it is better than none on both fingers
   of `palpate train transfer` (LOG).
 """
