@@ -27,9 +27,9 @@ REGION = Region(x_from_m=-12e-3, x_to_m=3e-3, half_width_m=5e-3)
 
 TILT_MOST_RAD = math.radians(40.0)
 
-DEPTH_LEAST_M = 0.6e-3
-DEPTH_MOST_M = 3.4e-3
-TILTED_DEPTH_MOST_M = 2.0e-3
+DEPTH_LEAST_M = 1.0e-3
+DEPTH_MOST_M = 3.8e-3
+TILTED_DEPTH_MOST_M = 3.0e-3
 """Depth [m]: at most the one along the normal, and the other at the largest tilt."""
 
 MOVED_SHARE = 0.15
@@ -108,7 +108,8 @@ def _segments(random: np.random.Generator) -> Iterator[PathSegment]:
     tilt = float(random.uniform(0.0, TILT_MOST_RAD))
     share = tilt / TILT_MOST_RAD
     most_m = (1.0 - share) * DEPTH_MOST_M + share * TILTED_DEPTH_MOST_M
-    depth_m = float(random.uniform(DEPTH_LEAST_M, most_m))
+    # Forces rise steeply at the end, so deep presses are more likely: their density rises linearly.
+    depth_m = DEPTH_LEAST_M + (most_m - DEPTH_LEAST_M) * math.sqrt(random.uniform())
     yield PathSegment("press", depth_m, tilt, _any_angle(random), _any_angle(random))
     move = random.uniform()
     if move < MOVED_SHARE:
