@@ -8,7 +8,7 @@ from typing import no_type_check
 import numpy as np
 import pytest
 import warp as wp
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.fem import numpy_indenter
@@ -17,7 +17,7 @@ from palpate.rigid import rotation_matrices, to_local
 from palpate_fem.device import DEVICE, mat33s, scalars, vec3s
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.distance import distance, signed_distance
-from palpate_fem.indenter.kernels import indenter_distance
+from palpate_fem.indenter.kernels import ON_AXIS, indenter_distance
 from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
 
 Floats = NDArray[np.float64]
@@ -141,12 +141,14 @@ def test_outside_the_foot_of_the_normal_lies_on_the_surface(name: str) -> None:
 @EVERY
 @settings(max_examples=60)
 @given(a=POINT, b=POINT)
+@example(a=(-0.00390625, 0.0, -0.001953125), b=(-2.220446049250313e-16, 0.0, -0.001953125))
 def test_the_gap_changes_no_more_than_the_point_moves(
     name: str, a: tuple[float, float, float], b: tuple[float, float, float]
 ) -> None:
     points = np.array([a, b])
     gap = signed_distance(make_indenter(name), points)
-    assert abs(gap[0] - gap[1]) <= np.linalg.norm(points[0] - points[1]) + ROUNDING
+    # So near to its axis a solid of revolution takes a point for one on it.
+    assert abs(gap[0] - gap[1]) <= np.linalg.norm(points[0] - points[1]) + ON_AXIS
 
 
 @EVERY
