@@ -278,13 +278,14 @@ and rivals on the same inputs.
 
 TOLD = """## What it says
 
-* **Where a specimen was met, presses limit; where it was not, specimens do.** More passes and less
-  noise in training take the error from 2 N on presses that were learned from to 12 %, on others to
-  29 %, on other specimens to no less than 42 % ([LOG](../../training/LOG.md)). Eighty specimens to
-  learn from are too few: on a specimen that was not met, forces are too small or too large by one
-  factor (standard deviation of its logarithm 0.55 over the fifteen), which goes with how high its
-  core sits (rank correlation -0.8) and how thick its unloaded film is (-0.7). The first is in the
-  electrodes at rest, the second is not: that takes a press.
+* **Where a specimen was met, presses limit; where it was not, the specimen does.** More passes and
+  less noise in training take the error from 2 N on presses that were learned from to 12 %, on
+  others to 29 %, on other specimens to no less than 42 % ([LOG](../../training/LOG.md)). There,
+  forces are too small or too large by one factor (standard deviation of its logarithm 0.55 over the
+  fifteen), which goes with how high the core sits (rank correlation -0.8) and how thick the
+  unloaded film is (-0.7). Ten times as many specimens to learn from, with as many trials, do not
+  change it: what a specimen's films do under pressure is not in its electrodes at rest, and takes a
+  press.
 * **A common offset does no harm**: 0.05 of a logarithm on all electrodes changes no median by 3 %.
 * **Centre of pressure and contact normal** are what an unknown finger can be asked for: 0.5 mm and
   2.2 degrees, of 5 mm and 24 degrees for a constant.
