@@ -39,8 +39,7 @@ class Launches:
             dim: Number of threads, or of each dimension.
             inputs: Its first arguments.
             outputs: The others.
-            block: Threads of a block; one number for all kernels of a module, which is compiled
-                for it.
+            block: Threads of a block; a module is compiled once for each number.
         """
         if dim == 0 or (isinstance(dim, tuple) and 0 in dim):
             return
