@@ -49,6 +49,7 @@ from palpate_fem.trajectory import press_path
 
 fakes: Any = importlib.import_module("fem_fakes")
 sweeps: Any = importlib.import_module("test_sweep")
+run, into_store = sweeps.run_batch, sweeps.store_batch
 
 PATIENCE_S = 60.0
 SAME = 2e-3
@@ -77,32 +78,6 @@ def batch_of(kind: float, devices: int = 1, **more: Any) -> DeviceBatch:
     parameters = FingertipParameters(friction_coefficient=kind)
     setup = WorkerSetup("fem_fakes:make", more.pop("options", {}), parameters, 1)
     return DeviceBatch(setup, ["cpu"] * devices, **{"slots": 3, **more})
-
-
-def run(
-    batch: DeviceBatch,
-    plans: list[PlannedPath],
-    on_report: Callable[[BatchReport], None] | None = None,
-) -> tuple[BatchReport, dict[str, IndentationResult]]:
-    """Run and close; each trajectory is answered no more than once."""
-    kept: dict[str, IndentationResult] = {}
-
-    def keep(plan: Any, result: IndentationResult) -> None:
-        assert plan.name not in kept
-        kept[plan.name] = result
-
-    with batch:
-        report = batch.run(
-            plans, len(plans), stop=threading.Event(), on_trajectory=keep, on_report=on_report
-        )
-    return report, kept
-
-
-def into_store(path: Path, batch: DeviceBatch, plans: Any, **more: Any) -> tuple[BatchReport, int]:
-    with batch:
-        return sweep_into_store(
-            batch, plans, path, **{"stop": threading.Event(), "packers": 1, **more}
-        )
 
 
 def three_presses(tip: StoredFingertip) -> list[PlannedPath]:

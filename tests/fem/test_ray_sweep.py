@@ -17,7 +17,6 @@ from palpate.cluster import RayCluster
 from palpate.errors import ConfigError, RemoteError
 from palpate_fem.cli import model as cli_model
 from palpate_fem.config import FingertipParameters
-from palpate_fem.result import IndentationResult
 from palpate_fem.service import ray_batch
 from palpate_fem.service.batch import BatchReport, SimulationBatch, sweep_into_store
 from palpate_fem.service.jobs import WorkerSetup
@@ -28,6 +27,7 @@ pytest.importorskip("ray", reason="needs palpate[cluster]")
 
 fakes: Any = importlib.import_module("fem_fakes")
 sweeps: Any = importlib.import_module("test_sweep")
+run, into_store = sweeps.run_batch, sweeps.store_batch
 on_host: Any = importlib.import_module("test_device_sweep")
 short, hard, rest = on_host.short, on_host.hard, on_host.rest
 
@@ -60,30 +60,6 @@ def batch_of(cluster: RayCluster, kind: float, device: str | None = "cpu", **mor
     parameters = FingertipParameters(friction_coefficient=kind)
     setup = WorkerSetup("fem_fakes:make", more.pop("options", {}), parameters, 1)
     return RayBatch(cluster, setup, device=device, **{"slots": 3, "look_s": 0.2, **more})
-
-
-def run(
-    batch: RayBatch, plans: Any, on_report: Callable[[BatchReport], None] | None = None
-) -> tuple[BatchReport, dict[str, IndentationResult]]:
-    """Run and close; each trajectory is answered no more than once."""
-    kept: dict[str, IndentationResult] = {}
-
-    def keep(plan: Any, result: IndentationResult) -> None:
-        assert plan.name not in kept
-        kept[plan.name] = result
-
-    with batch:
-        report = batch.run(
-            plans, len(plans), stop=threading.Event(), on_trajectory=keep, on_report=on_report
-        )
-    return report, kept
-
-
-def into_store(path: Path, batch: RayBatch, plans: Any, **more: Any) -> tuple[BatchReport, int]:
-    with batch:
-        return sweep_into_store(
-            batch, plans, path, **{"stop": threading.Event(), "packers": 1, **more}
-        )
 
 
 def test_the_store_of_a_cluster_is_that_of_the_cpu(cluster: RayCluster, tmp_path: Path) -> None:

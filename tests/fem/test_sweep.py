@@ -21,7 +21,7 @@ from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.indenter.distance import signed_distance
 from palpate_fem.result import IndentationOutcome, IndentationResult
-from palpate_fem.service.batch import BatchReport, SimulationBatch, sweep_into_store
+from palpate_fem.service.batch import BatchReport, OnReport, SimulationBatch, sweep_into_store
 from palpate_fem.service.jobs import WorkerSetup
 from palpate_fem.store.read import SimulationStore
 
@@ -93,6 +93,31 @@ def test_what_fails_does_not_stop_the_others(kind: str, said: str) -> None:
 def test_a_solver_that_does_not_start_ends_the_sweep() -> None:
     with pytest.raises(RemoteError, match="no such mesh"):
         run(fakes.QUICK, 2, options={"broken": "no such mesh"})
+
+
+def run_batch(
+    batch: Any, plans: Any, on_report: OnReport | None = None
+) -> tuple[BatchReport, dict[str, IndentationResult]]:
+    """Run and close; each trajectory is answered no more than once."""
+    kept: dict[str, IndentationResult] = {}
+
+    def keep(plan: Any, result: IndentationResult) -> None:
+        assert plan.name not in kept
+        kept[plan.name] = result
+
+    with batch:
+        report = batch.run(
+            plans, len(plans), stop=threading.Event(), on_trajectory=keep, on_report=on_report
+        )
+    return report, kept
+
+
+def store_batch(path: Path, batch: Any, plans: Any, **more: Any) -> tuple[BatchReport, int]:
+    """Run into a store and close."""
+    with batch:
+        return sweep_into_store(
+            batch, plans, path, **{"stop": threading.Event(), "packers": 1, **more}
+        )
 
 
 def into_store(path: Path, kind: float, count: int, stop: threading.Event) -> Any:
