@@ -176,11 +176,10 @@ def draw_set(found: dict[str, Any], path: Path) -> None:
     finish(figure, path, "The set", "Pad seen through the skin; the clamp is at x = -14 mm.")
 
 
-def draw_networks(networks: dict[str, dict[str, Any]], path: Path) -> None:
+def draw_network(report: dict[str, Any], path: Path) -> None:
     """Errors on presses that were not seen, beside those of ridge and constant."""
     figure = new_figure(11.0, 3.0)
     shown = [key for key in FIGURES if key != "force_angle_rad"]
-    report = networks[next(iter(networks))]
     cells = list(CELLS)[1::2]
     for k, (axes, key) in enumerate(zip(figure.subplots(1, len(shown)), shown, strict=True)):
         seen, unseen = (report["cells"][cell] for cell in cells)
@@ -197,7 +196,7 @@ def draw_networks(networks: dict[str, dict[str, Any]], path: Path) -> None:
         grid(axes, "y")
     told = (
         "On presses that were not seen: of a specimen that was, and of one that was not; ridge and "
-        "constant on the latter."
+        f"constant on the latter. {report['name']}."
     )
     finish(figure, path, "One network for all specimens", told)
 
@@ -321,7 +320,7 @@ def main() -> None:
         report = json.loads(path.read_text(encoding="utf-8"))
         networks.setdefault(report["name"], []).append(report)
     draw_set(found, FOLDER / "set.png")
-    draw_networks({name: reports[0] for name, reports in networks.items()}, FOLDER / "network.png")
+    draw_network(list(networks.values())[-1][0], FOLDER / "network.png")
     PAGE.write_text(page(found, networks).rstrip() + "\n", encoding="utf-8")
 
 

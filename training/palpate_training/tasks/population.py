@@ -89,12 +89,14 @@ class PopulationSplit:
         validation: Sets of rows to stop on: specimens that are learned from, and others.
         cells: Rows of each cell that is reported, by name.
         specimens: Names of the unseen specimens.
+        points: Number of points that were dealt.
     """
 
     train: Mask
     validation: tuple[Mask, ...]
     cells: dict[str, Mask]
     specimens: tuple[str, ...]
+    points: int
 
 
 def split_population(data: FeatureDataset, *, seed: int) -> PopulationSplit:
@@ -105,7 +107,8 @@ def split_population(data: FeatureDataset, *, seed: int) -> PopulationSplit:
     """
     rng = np.random.default_rng(seed)
     specimen = _dealt(rng, data.sensor, UNSEEN_SPECIMENS, STOPPED_SPECIMENS, "specimens")
-    press = _dealt(rng, points_of(data), UNSEEN_POINTS, STOPPED_POINTS, "points")
+    point = points_of(data)
+    press = _dealt(rng, point, UNSEEN_POINTS, STOPPED_POINTS, "points")
     train = (specimen == _LEARNED) & (press == _LEARNED)
     validation = tuple((specimen == side) & (press == _STOPPED) for side in (_LEARNED, _STOPPED))
     cells = {
@@ -126,6 +129,7 @@ def split_population(data: FeatureDataset, *, seed: int) -> PopulationSplit:
         tuple(rows for rows in validation if (rows & touched).any()),
         cells,
         tuple(data.sensor_names[i] for i in np.unique(data.sensor[specimen == _UNSEEN])),
+        len(np.unique(point)),
     )
 
 
@@ -229,7 +233,7 @@ def train_population(
         "data_sha256": data.content_sha256(),
         "rows": {"all": len(data), "train": int(split.train.sum())},
         "presses": len(np.unique(data.group)),
-        "points": len(np.unique(points_of(data))),
+        "points": split.points,
         "specimens": len(data.sensor_names),
         "unseen_specimens": split.specimens,
         "quantities": quantities,

@@ -174,7 +174,12 @@ def read_clear(simulator: TwinSimulator, path: Path, name: str) -> ClearTrajecto
     Raises:
         DatasetError: It is damaged.
     """
-    store, fingertip = _opened(simulator, path)
+    return _clear(simulator, *_opened(simulator, path), name)
+
+
+def _clear(
+    simulator: TwinSimulator, store: IndentationStore, fingertip: SimulatedFingertip, name: str
+) -> ClearTrajectory:
     trajectory = store.trajectory(name)
     return ClearTrajectory(trajectory, simulator.clear_steps(trajectory, fingertip))
 
@@ -352,7 +357,7 @@ def _tasks(
     *,
     in_worker: bool,
 ) -> Iterator[TrialTask]:
-    errors = registration_errors(specimens, spec.seed)
+    errors, fingertip = registration_errors(specimens, spec.seed), store.fingertip()
     for plan in plans:
         who = [i for i, one in enumerate(specimens) if one.pressed_with(plan.indenter)]
         if 0 < spec.units_each < len(who):
@@ -360,15 +365,17 @@ def _tasks(
             who = sorted(draw.choice(who, spec.units_each, replace=False).tolist())
         if not who:
             continue
-        read = partial(read_clear, simulator, store.path, plan.trajectory)
+        name = plan.trajectory
         yield TrialTask(
-            name=plan.trajectory,
+            name=name,
             arm=plan.arm,
             direction=plan.direction,
             planned_m=plan.depth_m - spec.overtravel_m
             if isinstance(plan, PlannedTrajectory)
             else None,
-            simulated=read if in_worker else partial(_given, read()),
+            simulated=partial(read_clear, simulator, store.path, name)
+            if in_worker
+            else partial(_given, _clear(simulator, store, fingertip, name)),
             specimens=tuple(specimens[i] for i in who),
             measured=tuple(
                 specimens[i].name for i in (who if spec.units_each else range(len(specimens)))
