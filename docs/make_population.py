@@ -1,8 +1,10 @@
 """Write docs/results/population.md: a large simulated set, and one network for its specimens.
 
-    palpate fem units draw 100 --seed 1 --out units.json
-    palpate data generate FOLDER --random 20000 --seed 1 --units units.json --units-each 2 ...
-    python docs/make_population.py --set FOLDER/mixed.h5 --seed 1      statistics of the set
+    palpate fem units draw 120 --seed 2 --out units.json
+    palpate data generate FOLDER --random 20000 --fingertips 20 --seed 2 --units units.json \\
+        --units-each 2 ...
+    python docs/make_population.py --set FOLDER/fingertip-*             statistics of the set
+    palpate data features FOLDER/fingertip-*/mixed.h5 features.h5
     palpate train population features.h5 OUT                            OUT/population.json
     python docs/make_population.py --network NAME OUT                   keeps that report
     python docs/make_population.py                                      page and pictures
@@ -42,6 +44,12 @@ PAGE = FOLDER.with_suffix(".md")
 SET = "set.json"
 
 ENDS = (5.0, 50.0, 95.0)
+SKINS = {
+    "skin's thickness [mm]": ("skin_thickness_m", 1e3),
+    "skin's shear modulus [kPa]": ("shear_modulus_pa", 1e-3),
+    "fluid [ml]": ("fluid_volume_m3", 1e6),
+    "friction [1]": ("friction_coefficient", 1.0),
+}
 HARD_N = 2.0
 CELLS = {
     "seen_specimen_seen_press": "learned from",
@@ -59,46 +67,64 @@ FIGURES = {
 }
 
 
-def statistics(parts: list[MixedDataset], seed: int) -> dict[str, Any]:
-    """Numbers and bands of a set that was generated in one or several parts."""
+def statistics(folders: list[Path]) -> dict[str, Any]:
+    """Numbers and bands of a set on one or several fingertips, each in a folder of its own."""
     rows: dict[str, list[Floats]] = {}
-    names: set[str] = set()
-    trials = 0
-    for data in parts:
-        names |= set(data.experiment.trajectories)
-        trials += data.experiment.trials
+    planned: dict[str, list[float]] = {key: [] for key in ("tilt", "depth", "slide", "twist")}
+    skins: dict[str, list[float]] = {key: [] for key in SKINS}
+    indenters: Counter[str] = Counter()
+    count: Counter[str] = Counter()
+    loss_um, digests, maps = [], [], []
+    for folder in folders:
+        data = read_mixed(folder / "mixed.h5")
+        spec = json.loads((folder / "experiment.json").read_text(encoding="utf-8"))["spec"]
         for name, column in columns(data).items():
             rows.setdefault(name, []).append(column)
+        for name in data.experiment.trajectories:
+            first, *move = segments_of(spec["seed"], number_of(name))
+            planned["tilt"].append(math.degrees(first.angle_rad))
+            planned["depth"].append(1e3 * (first.amount or 0.0))
+            for one in move:
+                far = abs(one.amount or 0.0)
+                planned[one.kind].append(1e3 * far if one.kind == "slide" else math.degrees(far))
+        for name, (key, factor) in SKINS.items():
+            skins[name].append(factor * spec[key])
+        indenters.update(data.experiment.indenters)
+        count["presses planned"] += spec["presses"]
+        count["presses with rows"] += len(data.experiment.trajectories)
+        count["trials"] += data.experiment.trials
+        count["rows"] += len(data)
+        count["specimens"] += len(data.experiment.unit_names)
+        loss_um.append([1e6 * data.basis.loss_mean, float(len(data.basis.modes))])
+        digests.append(data.experiment.provenance.input_sha256)
+        maps.append(placed(data))
     values = {name: np.concatenate(some) for name, some in rows.items()}
-    planned: dict[str, list[float]] = {key: [] for key in ("tilt", "depth", "slide", "twist")}
-    for name in sorted(names):
-        first, *move = segments_of(seed, number_of(name))
-        planned["tilt"].append(math.degrees(first.angle_rad))
-        planned["depth"].append(1e3 * (first.amount or 0.0))
-        for one in move:
-            amount = abs(one.amount or 0.0)
-            planned[one.kind].append(1e3 * amount if one.kind == "slide" else math.degrees(amount))
+    loss, modes = np.transpose(loss_um)
     bands: dict[str, Any] = {
         "tilt [deg]": planned["tilt"],
         "depth [mm]": planned["depth"],
         "slide, of those that do [mm]": planned["slide"],
         "twist, of those that do [deg]": planned["twist"],
         **values,
+        **skins,
     }
     return {
         "numbers": {
-            "presses with rows": len(names),
-            "of these slide": len(planned["slide"]),
-            "of these twist": len(planned["twist"]),
-            "trials": trials,
-            "rows": len(values["force [N]"]),
-            "specimens": len({unit for data in parts for unit in data.experiment.unit_names}),
-            "indenters": dict(sorted(Counter(name.split("/")[0] for name in names).items())),
+            "fingertips": len(folders),
+            **count,
+            "of the presses slide": len(planned["slide"]),
+            "of the presses twist": len(planned["twist"]),
             f"share of rows from {HARD_N:g} N": float(np.mean(values["force [N]"] >= HARD_N)),
             "share of rows from 8 N": float(np.mean(values["force [N]"] >= 8.0)),
+            "modes of the displacement, on average": float(modes.mean()),
+            "what they lose on average [um]": float(loss.mean()),
+            "indenters": dict(sorted(indenters.items())),
         },
-        "bands": {name: np.percentile(some, ENDS).tolist() for name, some in bands.items()},
-        "map": placed(parts),
+        "input_sha256": digests,
+        "bands": {
+            name: np.percentile(some, ENDS).tolist() for name, some in bands.items() if len(some)
+        },
+        "map": maps[0] | {"rows": np.sum([one["rows"] for one in maps], axis=0).tolist()},
     }
 
 
@@ -147,9 +173,10 @@ def columns(data: MixedDataset) -> dict[str, Floats]:
     return {name: np.asarray(values, np.float64) for name, values in found.items()}
 
 
-def placed(parts: list[MixedDataset]) -> dict[str, Any]:
+def placed(data: MixedDataset) -> dict[str, Any]:
     """How many rows have their centre of pressure where, on a grid of 0.5 mm."""
-    points = np.concatenate([part.contact.centre for part in parts if part.contact is not None])
+    assert data.contact is not None
+    points = data.contact.centre
     x, y = np.arange(-18.0, 8.01, 0.5), np.arange(-8.0, 8.01, 0.5)
     count, _, _ = np.histogram2d(1e3 * points[:, 0], 1e3 * points[:, 1], bins=(x, y))
     return {"x_mm": x.tolist(), "y_mm": y.tolist(), "rows": count.astype(int).tolist()}
@@ -296,14 +323,13 @@ TOLD = """## What it says
 def main() -> None:
     """Keep statistics or a report, or write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--set", type=Path, nargs="+", help="mixed data sets of presses at random")
-    parser.add_argument("--seed", type=int, default=1, help="of the set")
+    parser.add_argument("--set", type=Path, nargs="+", help="folders of presses at random")
     parser.add_argument("--told", default="", help="what is to be said of the set")
     parser.add_argument("--network", nargs=2, metavar=("NAME", "FOLDER"), help="a report to keep")
     options = parser.parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)
     if options.set:
-        found = statistics([read_mixed(path) for path in options.set], options.seed)
+        found = statistics(options.set)
         text = json.dumps({"told": options.told} | found, indent=1)
         (FOLDER / SET).write_text(text + "\n", encoding="utf-8")
         return

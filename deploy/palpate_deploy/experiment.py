@@ -55,6 +55,7 @@ from palpate_fem.trajectory import (
     segment_path,
 )
 from palpate_training.experiment.generate.simulator import (
+    SKIN,
     ElectrodeStream,
     ExperimentSpec,
     OnProgress,
@@ -86,7 +87,13 @@ AMBIENT_C = 25.0
 
 def parameters_of(spec: ExperimentSpec) -> FingertipParameters:
     """Parameters of an experiment's fingertip."""
-    return FingertipParameters(fluid_volume_m3=spec.fluid_volume_m3)
+    given = {name: getattr(spec, name) for name in SKIN if getattr(spec, name) is not None}
+    return FingertipParameters(fluid_volume_m3=spec.fluid_volume_m3, **given)
+
+
+def fingertip_settings(parameters: FingertipParameters) -> dict[str, float | None]:
+    """A drawn fingertip as settings of an experiment."""
+    return {name: getattr(parameters, name) for name in (*SKIN, "fluid_volume_m3")}
 
 
 def _mesh_options(spec: ExperimentSpec) -> dict[str, object]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,8 +22,10 @@ from palpate_deploy.cli.options import JsonOption, show_left_out
 from palpate_training import EXTRA_MODULES
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
     from palpate_training.experiment.generate.measured import Dropped, ProcessedExperiment
-    from palpate_training.experiment.generate.pipeline import GeneratedExperiment
+    from palpate_training.experiment.generate.pipeline import GeneratedExperiment, OnStage
     from palpate_training.experiment.generate.simulator import OnProgress
     from palpate_training.experiment.plan import EliminatedTrajectory, RobotPlan
 
@@ -123,6 +125,14 @@ def data_generate(
             "slide or twist; spheres and cylinders of sizes between the nine's, too.",
         ),
     ] = None,
+    fingertips: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="--random: so many fingertips, each with a skin, fill and friction of its own, a "
+            "share of the presses and of the specimens, and a folder in FOLDER.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of points, registration and noise.")] = 0,
     indenter: IndenterOption = None,
     units: UnitsOption = None,
@@ -138,7 +148,9 @@ def data_generate(
         ),
     ] = None,
     edge_mm: Annotated[float, typer.Option(help="Edge of the mesh on the pad [mm].")] = 0.6,
-    fill_ml: Annotated[float, typer.Option(help="Fluid under the skin [ml].")] = 0.6,
+    fill_ml: Annotated[
+        float | None, typer.Option(help="Fluid under the skin [ml] [default: 0.6].")
+    ] = None,
     workers: Annotated[
         int, typer.Option("--workers", min=0, help="Processes; 0 = one for each core.")
     ] = 0,
@@ -165,24 +177,31 @@ def data_generate(
 ) -> None:
     """Press indenters on simulated BioTacs; write both of the paper's data sets.
 
-    As the paper does: nine indenters at ten points of three specimens. Or at random.
+    As the paper does: nine indenters at ten points of three specimens. Or at random, on one
+    fingertip or on several.
     """
-    from palpate_deploy.experiment import FemSimulator, read_specimens
+    from palpate_deploy.experiment import FemSimulator, fingertip_settings, read_specimens
     from palpate_fem.cli.model import workers_for
     from palpate_fem.cli.terminal import progress_bar, stop_on_signal
     from palpate_fem.config import LIMITS
     from palpate_fem.indenter.catalogue import make_indenter
     from palpate_fem.indenter.path import parse_segments, show_segments
+    from palpate_fem.population.fingertips import draw_fingertips
     from palpate_fem.service.device_process import check_places
+    from palpate_training.experiment.generate.fingertips import FingertipShare, share_out
+    from palpate_training.experiment.generate.pipeline import MIXED, is_finished
     from palpate_training.experiment.generate.pipeline import generate as run
-    from palpate_training.experiment.generate.simulator import ExperimentSpec
+    from palpate_training.experiment.generate.simulator import FLUID_VOLUME_M3, ExperimentSpec
 
     check_places(device or (), slots, ray)
+    fill_m3 = FLUID_VOLUME_M3 if fill_ml is None else fill_ml * 1e-6
     low, high = LIMITS["fluid_volume_m3"]
-    if not low < fill_ml * 1e-6 <= high:
+    if not low < fill_m3 <= high:
         raise typer.BadParameter(f"{fill_ml} ml is not within {low * 1e6:g} to {high * 1e6:g}")
     if random and (points is not None or angled is not None or path):
         raise typer.BadParameter("--random has no --points, --angled or --path")
+    if fingertips and (not random or fill_ml is not None):
+        raise typer.BadParameter("--fingertips needs --random, and has no --fill-ml")
     specimens = read_specimens(units)
     if units_each > len(specimens):
         raise typer.BadParameter(f"--units-each {units_each}: there are {len(specimens)} specimens")
@@ -193,40 +212,61 @@ def data_generate(
         units_each=units_each,
         seed=seed,
         edge_m=edge_mm * 1e-3,
-        fluid_volume_m3=fill_ml * 1e-6,
+        fluid_volume_m3=fill_m3,
         indenters=tuple(make_indenter(name).name for name in indenter or ()),
         paths=tuple(show_segments(parse_segments(words)) for words in path or ()),
     )
+    shares: Sequence[FingertipShare] = [FingertipShare("", spec, specimens)]
+    if fingertips:
+        drawn = [fingertip_settings(tip) for tip in draw_fingertips(fingertips, seed)]
+        shares = share_out(spec, drawn, specimens)
     count, threads = workers_for(workers)
-    with stop_on_signal() as stop, progress_bar() as bar:
-        tasks = {}
-
-        def on_stage(stage: str, done: int, total: int, word: str) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done, total=total, info=word)
-
-        result = run(
-            out,
-            spec,
-            specimens,
-            FemSimulator(),
-            workers=count,
-            threads=threads,
-            ray=ray,
-            devices=tuple(device or ()),
-            slots=slots,
-            stop=stop,
-            on_stage=on_stage,
-            command=typed_command(),
-        )
-    if result is None:
-        typer.echo(f"stopped; {out} keeps what is done: run the command again to go on")
-        raise typer.Exit(1)
+    summaries: list[dict[str, object]] = []
+    for share in shares:
+        folder = out / share.name
+        if fingertips and is_finished(folder, share.spec, share.specimens):
+            summaries.append({"folder": str(folder), "finished": "before"})
+            continue
+        with stop_on_signal() as stop, progress_bar() as bar:
+            result = run(
+                folder,
+                share.spec,
+                share.specimens,
+                FemSimulator(),
+                workers=count,
+                threads=threads,
+                ray=ray,
+                devices=tuple(device or ()),
+                slots=slots,
+                stop=stop,
+                on_stage=_stages(bar, share.name),
+                command=typed_command(),
+            )
+        if result is None:
+            typer.echo(f"stopped; {out} keeps what is done: run the command again to go on")
+            raise typer.Exit(1)
+        summaries.append(_generated_summary(result))
+        if not as_json:
+            _show_generated(result)
     if as_json:
-        typer.echo(json.dumps(_generated_summary(result), indent=1))
-    else:
-        _show_generated(result)
+        typer.echo(json.dumps(summaries if fingertips else summaries[0], indent=1))
+    elif fingertips:
+        typer.echo(
+            f"{fingertips} fingertips; their rows together: palpate data features"
+            f" {out}/fingertip-*/{MIXED} features.h5"
+        )
+
+
+def _stages(bar: Progress, prefix: str) -> OnStage:
+    """Shows each stage of an experiment in a progress bar."""
+    tasks: dict[str, TaskID] = {}
+
+    def on_stage(stage: str, done: int, total: int, word: str) -> None:
+        if stage not in tasks:
+            tasks[stage] = bar.add_task(f"{prefix} {stage}".strip(), total=total)
+        bar.update(tasks[stage], completed=done, total=total, info=word)
+
+    return on_stage
 
 
 @twin_app.command(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +21,7 @@ from palpate_training.datasets.features import (
     FEATURE_COLUMNS,
     FEATURES_SCHEMA,
     FeatureDataset,
+    joined,
     open_dataset,
     write_dataset,
 )
@@ -140,7 +141,12 @@ def data_export(
 
 
 def data_features(
-    path: DataArgument,
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="DATA...", help="Data sets (.h5), or folders of published files; joined."
+        ),
+    ],
     out: Annotated[Path, typer.Argument(help="Data set to write (.h5).")],
     untouched_rows: Annotated[
         int, typer.Option(min=0, help="Rows at rest added to each trial.")
@@ -152,12 +158,16 @@ def data_features(
     axes: AxesOption = "x,y,z",
     force_on_indenter: ForceOption = False,
 ) -> None:
-    """Data set of an experiment -> rows for `palpate train features`.
+    """Data sets of experiments -> rows for `palpate train features`, all in one file.
 
     palpate data features twin.h5 twin-features.h5
     """
-    _, data = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
-    rows = features(data, untouched_rows=untouched_rows, assumed_rest=assumed_rest)
+    parts = []
+    for path in paths:
+        _, data = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
+        part = features(data, untouched_rows=untouched_rows, assumed_rest=assumed_rest)
+        parts.append(replace(part, name=str(path)))
+    rows = parts[0] if len(parts) == 1 else joined(parts, command=typed_command())
     write_dataset(out, rows)
     console.print(contents(rows, str(out)))
 

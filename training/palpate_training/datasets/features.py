@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from palpate import __version__
 from palpate.errors import DatasetError
 from palpate.files.hdf5 import Hdf5Schema, hdf5_written_whole, opened, read_array, text
 from palpate.messages import COUNTS_MAX
@@ -100,6 +103,62 @@ class FeatureDataset:
         for name, array in self.arrays().items():
             add_array(digest, name, array)
         return digest.hexdigest()
+
+
+def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureDataset:
+    """Put data sets together; groups and blocks of different ones stay apart.
+
+    Sensors of the same name are the same sensor.
+
+    Args:
+        parts: At least one, all with the same columns.
+        command: For provenance.
+
+    Raises:
+        DatasetError: A part lacks a column that another one has, or has another licence.
+    """
+    columns = [set(part.arrays()) for part in parts]
+    for part, have in zip(parts, columns, strict=True):
+        if missing := sorted(set.union(*columns) - have):
+            raise DatasetError(
+                f"{part.name} does not say {', '.join(missing)}, as another data set does",
+                remedy="join data sets with the same columns",
+            )
+    licences = dict.fromkeys(part.provenance.licence for part in parts)
+    if len(licences) > 1:
+        raise DatasetError(
+            f"the licences differ: {'; '.join(licences)}", remedy="join data sets of one licence"
+        )
+    names = tuple(dict.fromkeys(name for part in parts for name in part.sensor_names))
+    arrays: dict[str, list[npt.NDArray[np.generic]]] = {}
+    first = {"group": 0, "block": 0}
+    for part in parts:
+        own = dict(part.arrays())
+        own["sensor"] = np.array([names.index(name) for name in part.sensor_names])[part.sensor]
+        for name in first:
+            _, number = np.unique(own[name], return_inverse=True)
+            own[name] = first[name] + number
+            first[name] += int(number.max(initial=-1)) + 1
+        for name, array in own.items():
+            arrays.setdefault(name, []).append(array.astype(getattr(part, name).dtype))
+    content = hashlib.sha256("\n".join(part.content_sha256() for part in parts).encode())
+    sources = Counter(part.provenance.source for part in parts)
+    return FeatureDataset(
+        **{name: np.concatenate(some) for name, some in arrays.items()},
+        sensor_names=names,
+        provenance=Provenance(
+            source="; ".join(
+                f"{count} of: {source}" if count > 1 else source
+                for source, count in sources.items()
+            ),
+            command=command,
+            input_sha256=content.hexdigest(),
+            licence=next(iter(licences)),
+            palpate_version=__version__,
+            notes=f"{len(parts)} joined; input_sha256 is the digest of their contents",
+        ),
+        name="joined",
+    )
 
 
 def cut_into_blocks(rows: int, blocks: int) -> IndexArray:

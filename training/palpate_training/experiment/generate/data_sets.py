@@ -65,8 +65,8 @@ FORCE_MODES = 160
 as a few hundred hold the displacement; the data set says what is lost."""
 
 
-FIT_TRAJECTORIES = 1000
-"""Trajectories at most that the bases are fitted on: some gigabytes of fields on the disk."""
+FIT_TRAJECTORIES = 400
+"""Trajectories at most that the bases are fitted on: a gigabyte of fields on the disk."""
 
 OpenStore = Callable[[Path], IndentationStore]
 """Opens a store in a worker; can be pickled."""

@@ -260,6 +260,16 @@ def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen])
         )
 
 
+def is_finished(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen]) -> bool:
+    """Whether a folder holds the data sets of this experiment.
+
+    Raises:
+        ConfigError: The folder holds another experiment.
+    """
+    keep_spec(folder, spec, specimens)
+    return all((folder / name).exists() for name in (EXPERIMENT, MIXED))
+
+
 def write_idle(
     folder: Path, specimens: Sequence[Specimen], pressed: PressedSpecimens, *, seed: int
 ) -> Path:

@@ -32,6 +32,9 @@ FLUID_VOLUME_M3 = 6.0e-7
 EDGE_M = 0.6e-3
 """Edge of the mesh on the pad [m]; the mesh study puts its force error below 1 %."""
 
+SKIN = ("skin_thickness_m", "shear_modulus_pa", "friction_coefficient")
+"""Settings of an experiment that say what its skin is."""
+
 _STRAIGHT_M = 1e-9
 """A path that is longer than the distance of its ends by no more than this is straight [m]."""
 
@@ -55,6 +58,9 @@ class ExperimentSpec:
             direction and length are as written: no overtravel.
         presses: Presses at random instead of points, angles and paths; 0 = none.
         units_each: Specimens that execute each trajectory, drawn by its name; 0 = all.
+        skin_thickness_m: Of the unpressurised skin [m]; None = the simulator's own, as below.
+        shear_modulus_pa: Of the skin [Pa].
+        friction_coefficient: Between indenter and skin.
     """
 
     points: int = 10
@@ -67,14 +73,17 @@ class ExperimentSpec:
     paths: tuple[str, ...] = ()
     presses: int = 0
     units_each: int = 0
+    skin_thickness_m: float | None = None
+    shear_modulus_pa: float | None = None
+    friction_coefficient: float | None = None
 
     def content(self) -> dict[str, Any]:
         """As plain values; those that came later only where they are used."""
         values = asdict(self)
-        for key in ("paths", "presses", "units_each"):
-            if not values[key]:
-                del values[key]
-        return values
+        later = {"paths": (), "presses": 0, "units_each": 0, **dict.fromkeys(SKIN)}
+        return {
+            key: value for key, value in values.items() if key not in later or value != later[key]
+        }
 
 
 class SimulatedStep(Protocol):
