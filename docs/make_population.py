@@ -1,7 +1,7 @@
-"""Write docs/results/population.md: a large simulated set, and one network for its specimens.
+r"""Write docs/results/population.md: a large simulated set, and one network for its specimens.
 
     palpate fem units draw 120 --seed 2 --out units.json
-    palpate data generate FOLDER --random 20000 --fingertips 20 --seed 2 --units units.json \\
+    palpate data generate FOLDER --random 20000 --fingertips 20 --seed 2 --units units.json \
         --units-each 2 ...
     python docs/make_population.py --set FOLDER/fingertip-*             statistics of the set
     palpate data features FOLDER/fingertip-*/mixed.h5 features.h5

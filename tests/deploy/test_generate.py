@@ -22,9 +22,12 @@ from palpate.files.tape import read_tape
 from palpate_deploy.cli.data import twin_app
 from palpate_deploy.experiment import FemSimulator, specimens_of
 from palpate_fem.electrodes.specimen import SpecimenParameters
-from palpate_fem.population.members import PAPER, Member
+from palpate_fem.population.members import PAPER, Member, draw_members, write_population
 from palpate_fem.store.read import SimulationStore
 from palpate_training.datasets.experiment import read_experiment, read_mixed
+from palpate_training.datasets.export import features
+from palpate_training.datasets.features import joined
+from palpate_training.experiment.generate.fingertips import share_out
 from palpate_training.experiment.generate.pipeline import (
     EXPERIMENT,
     MIXED,
@@ -274,6 +277,53 @@ def test_presses_at_random_are_executed_on_some_of_the_specimens(tmp_path: Path)
     np.testing.assert_array_equal(again.data.experiment.tared, data.tared)
     every = replace(spec, units_each=0)
     assert provenance_sha256(every, four, "") != provenance_sha256(spec, four, "")
+
+
+def test_fingertips_have_skins_presses_and_specimens_of_their_own(tmp_path: Path) -> None:
+    runner, units, out = CliRunner(), tmp_path / "units.json", tmp_path / "several"
+    write_population(units, draw_members(4, 3), source="drawn")
+    words = ["generate", str(out), "--random", "5", "--fingertips", "2", "--units", str(units)]
+    words += ["--units-each", "1", "--edge-mm", "1.2", "--indenter", "sphere_medium"]
+    words += ["--workers", "1", "--json"]
+    done = runner.invoke(twin_app, words)
+    assert done.exit_code == 0, done.output
+    one, other = (out / "fingertip-01", out / "fingertip-02")
+    specs = [json.loads((tip / SPEC_FILE).read_text())["spec"] for tip in (one, other)]
+    assert [spec["presses"] for spec in specs] == [2, 3]
+    for key in ("skin_thickness_m", "shear_modulus_pa", "friction_coefficient", "fluid_volume_m3"):
+        assert specs[0][key] != specs[1][key]
+    skin = SimulationStore.open(other / STORE).fingertip()
+    assert skin.parameters.shear_modulus_pa == specs[1]["shear_modulus_pa"]
+    assert skin.parameters.friction_coefficient == specs[1]["friction_coefficient"]
+    parts = [read_mixed(tip / MIXED) for tip in (one, other)]
+    assert parts[0].experiment.unit_names == ("unit-001", "unit-002")
+    assert parts[1].experiment.unit_names == ("unit-003", "unit-004")
+    both = joined([features(part) for part in parts])
+    assert len(both) == sum(len(features(part)) for part in parts)
+    assert both.sensor_names == ("unit-001", "unit-002", "unit-003", "unit-004")
+    # Presses of different fingertips have the same names; they are different presses.
+    assert len(np.unique(both.group)) == sum(len(p.experiment.trajectories) for p in parts)
+    # What is there is not made again.
+    stamp = (other / MIXED).stat().st_mtime_ns
+    again = runner.invoke(twin_app, words)
+    assert [one["finished"] for one in json.loads(again.stdout)] == ["before", "before"]
+    assert (other / MIXED).stat().st_mtime_ns == stamp
+
+
+def test_fingertips_without_presses_or_specimens_are_refused(tmp_path: Path) -> None:
+    out = tmp_path / "no"
+    for extra, said in (
+        (("--fingertips", "2"), "needs --random"),
+        (("--random", "3", "--fingertips", "2", "--fill-ml", "0.6"), "has no --fill-ml"),
+    ):
+        refused = CliRunner().invoke(twin_app, ["generate", str(out), *extra])
+        assert refused.exit_code == 2
+        assert said in refused.output
+    many = ExperimentSpec(presses=3, units_each=2)
+    for count in (0, 2, 4):  # none; two specimens each for three units; more than presses
+        with pytest.raises(ConfigError, match=f"for {count} fingertips"):
+            share_out(many, [{}] * count, (*specimens(), specimens()[0]))
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("extra", [("--points", "3"), ("--angled", "0"), ("--path", "press 1 mm")])
