@@ -126,3 +126,30 @@ def mixed(mixed_rows: list[MixedRows], skin: SkinMesh, provenance: Provenance) -
     """The mixed data set of these trials."""
     basis = fit_basis(lambda: (one.displacement for one in mixed_rows))
     return assemble_mixed(mixed_rows, basis, skin, provenance)
+
+
+@pytest.fixture
+def large(
+    make_rows: Callable[..., TrialRows], skin: SkinMesh, provenance: Provenance
+) -> MixedDataset:
+    """Presses of three indenters, two, seven and nine, of eleven rows, with fields of no law."""
+    rng = np.random.default_rng(8)
+    outer = skin.nodes[skin.outer_faces]
+    normals = np.cross(outer[:, 1] - outer[:, 0], outer[:, 2] - outer[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    trials = []
+    for kind, count in (("cube", 2), ("ring", 7), ("sphere", 9)):
+        for k in range(count):
+            rows = make_rows("a", f"{kind}/{k:02d}/normal", rows=11)
+            moved = 1e-4 * rng.normal(size=(11, 12, 3)) * 0.5 ** np.arange(12)[:, None]
+            force = -rng.uniform(0.5, 1.0, (11, 6, 1)) * np.repeat(normals, 3, axis=0)
+            trials.append(
+                MixedRows(
+                    rows, 1.1 * rows.force, moved.astype(np.float32), force.astype(np.float32)
+                )
+            )
+    basis = fit_basis(lambda: (one.displacement for one in trials))
+    forces = fit_basis(
+        lambda: (one.contact_force for one in trials if one.contact_force is not None), count=6
+    )
+    return assemble_mixed(trials, basis, skin, provenance, contact_basis=forces)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,46 +11,14 @@ from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
 from palpate_training.cli import data_app
-from palpate_training.datasets.assembly import assemble_mixed
-from palpate_training.datasets.basis import fit_basis
-from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import (
     MixedDataset,
-    SkinMesh,
     content_sha256,
     read_mixed,
     write_experiment,
     write_mixed,
 )
 from palpate_training.datasets.shrink import SmallSize, shrink
-from palpate_training.datasets.trials import MixedRows, TrialRows
-
-
-@pytest.fixture
-def large(
-    make_rows: Callable[..., TrialRows], skin: SkinMesh, provenance: Provenance
-) -> MixedDataset:
-    """Presses of three indenters, two, seven and nine, of eleven rows, with fields of no law."""
-    rng = np.random.default_rng(8)
-    outer = skin.nodes[skin.outer_faces]
-    normals = np.cross(outer[:, 1] - outer[:, 0], outer[:, 2] - outer[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    trials = []
-    for kind, count in (("cube", 2), ("ring", 7), ("sphere", 9)):
-        for k in range(count):
-            rows = make_rows("a", f"{kind}/{k:02d}/normal", rows=11)
-            moved = 1e-4 * rng.normal(size=(11, 12, 3)) * 0.5 ** np.arange(12)[:, None]
-            force = -rng.uniform(0.5, 1.0, (11, 6, 1)) * np.repeat(normals, 3, axis=0)
-            trials.append(
-                MixedRows(
-                    rows, 1.1 * rows.force, moved.astype(np.float32), force.astype(np.float32)
-                )
-            )
-    basis = fit_basis(lambda: (one.displacement for one in trials))
-    forces = fit_basis(
-        lambda: (one.contact_force for one in trials if one.contact_force is not None), count=6
-    )
-    return assemble_mixed(trials, basis, skin, provenance, contact_basis=forces)
 
 
 def test_trials_are_whole_and_even_over_the_indenters(large: MixedDataset) -> None:

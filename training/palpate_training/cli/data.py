@@ -33,6 +33,7 @@ from palpate_training.datasets.ingest import (
 )
 from palpate_training.datasets.inspect import ExperimentContents, load
 from palpate_training.datasets.inspect import contents as experiment_contents
+from palpate_training.datasets.join import join_files
 from palpate_training.datasets.shrink import SMALL, SmallSize, shrink_file
 from palpate_training.datasets.trials import TRIALS_SCHEMA
 
@@ -198,6 +199,32 @@ def data_shrink(
     with console.status(f"reading {path.name}"):
         small = shrink_file(path, out, size, command=typed_command())
     console.print(experiment_table(experiment_contents(MIXED_SCHEMA.name, small), str(out)))
+    console.print(f"{out.stat().st_size / 1e6:.1f} MB")
+
+
+def data_join(
+    paths: Annotated[
+        list[Path], typer.Argument(metavar="MIXED...", help="Mixed data sets (.h5) of one mesh.")
+    ],
+    out: Annotated[Path, typer.Argument(help="Data set to write (.h5); must not exist.")],
+    modes: Annotated[
+        int, typer.Option(min=1, help="Common modes of the displacement, at most.")
+    ] = SMALL.modes,
+    force_modes: Annotated[
+        int, typer.Option(min=1, help="Common modes of the contact forces, at most.")
+    ] = SMALL.force_modes,
+) -> None:
+    """Mixed data sets of several fingertips -> one.
+
+    Shrink large ones first: all fields are compressed anew.
+
+    palpate data join small/fingertip-*.h5 small.h5
+    """
+    with console.status("compressing fields"):
+        joint = join_files(
+            paths, out, modes=modes, force_modes=force_modes, command=typed_command()
+        )
+    console.print(experiment_table(experiment_contents(MIXED_SCHEMA.name, joint), str(out)))
     console.print(f"{out.stat().st_size / 1e6:.1f} MB")
 
 

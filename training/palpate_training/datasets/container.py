@@ -7,6 +7,7 @@ import hashlib
 import logging
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from palpate import __version__
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.hdf5 import (
     Hdf5Schema,
@@ -53,6 +55,35 @@ class Provenance:
     licence: str
     palpate_version: str
     notes: str = ""
+
+
+def joined_provenance(
+    parts: Sequence[Provenance], contents: Sequence[str], command: str
+) -> Provenance:
+    """Where a data set comes from that is put together of several.
+
+    Args:
+        parts: Where each of them comes from.
+        contents: Digest of the content of each.
+        command: The command that joins them.
+
+    Raises:
+        DatasetError: Their licences differ.
+    """
+    licences = dict.fromkeys(part.licence for part in parts)
+    if len(licences) > 1:
+        raise DatasetError(
+            f"the licences differ: {'; '.join(licences)}", remedy="join data sets of one licence"
+        )
+    sources = Counter(part.source for part in parts)
+    return Provenance(
+        source="; ".join(f"{n} of: {one}" if n > 1 else one for one, n in sources.items()),
+        command=command,
+        input_sha256=hashlib.sha256("\n".join(contents).encode()).hexdigest(),
+        licence=next(iter(licences)),
+        palpate_version=__version__,
+        notes=f"{len(parts)} joined; input_sha256 is the digest of their contents",
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from palpate import __version__
 from palpate.errors import DatasetError
 from palpate.files.hdf5 import Hdf5Schema, hdf5_written_whole, opened, read_array, text
 from palpate.messages import COUNTS_MAX
@@ -24,6 +22,7 @@ from palpate_training.datasets.container import (
     Provenance,
     StoredColumn,
     add_array,
+    joined_provenance,
     read_provenance,
     write_provenance,
 )
@@ -124,11 +123,6 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
                 f"{part.name} does not say {', '.join(missing)}, as another data set does",
                 remedy="join data sets with the same columns",
             )
-    licences = dict.fromkeys(part.provenance.licence for part in parts)
-    if len(licences) > 1:
-        raise DatasetError(
-            f"the licences differ: {'; '.join(licences)}", remedy="join data sets of one licence"
-        )
     names = tuple(dict.fromkeys(name for part in parts for name in part.sensor_names))
     arrays: dict[str, list[npt.NDArray[np.generic]]] = {}
     first = {"group": 0, "block": 0}
@@ -141,21 +135,11 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
             first[name] += int(number.max(initial=-1)) + 1
         for name, array in own.items():
             arrays.setdefault(name, []).append(array.astype(getattr(part, name).dtype))
-    content = hashlib.sha256("\n".join(part.content_sha256() for part in parts).encode())
-    sources = Counter(part.provenance.source for part in parts)
     return FeatureDataset(
         **{name: np.concatenate(some) for name, some in arrays.items()},
         sensor_names=names,
-        provenance=Provenance(
-            source="; ".join(
-                f"{count} of: {source}" if count > 1 else source
-                for source, count in sources.items()
-            ),
-            command=command,
-            input_sha256=content.hexdigest(),
-            licence=next(iter(licences)),
-            palpate_version=__version__,
-            notes=f"{len(parts)} joined; input_sha256 is the digest of their contents",
+        provenance=joined_provenance(
+            [part.provenance for part in parts], [part.content_sha256() for part in parts], command
         ),
         name="joined",
     )

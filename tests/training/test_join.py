@@ -1,0 +1,102 @@
+"""Data sets of several fingertips as one: nothing is lost, mixed up or called the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from palpate.errors import DatasetError
+from palpate_training.cli import data_app
+from palpate_training.datasets.experiment import MixedDataset, read_mixed, write_mixed
+from palpate_training.datasets.features import FeatureDataset, joined
+from palpate_training.datasets.join import join_mixed
+
+
+def other_skin(data: MixedDataset) -> MixedDataset:
+    """The same presses on a thicker skin, whose fields are twice as large and turned."""
+    basis = replace(data.basis, modes=data.basis.modes[:, :, ::-1].copy())
+    return replace(
+        data,
+        basis=basis,
+        coefficients=2.0 * data.coefficients,
+        mesh=replace(data.mesh, nodes=data.mesh.nodes * np.float32(1.1)),
+    )
+
+
+def test_fields_and_rows_are_those_of_the_parts(large: MixedDataset) -> None:
+    parts = [large, other_skin(large)]
+    both = join_mixed(parts, ["a", "b"], modes=1000, force_modes=1000)
+    rows = len(large)
+    assert len(both) == 2 * rows
+    assert both.experiment.unit_names == large.experiment.unit_names
+    assert both.experiment.trials == 2 * large.experiment.trials
+    ours, theirs = (set(both.experiment.trajectories[k::2]) for k in range(2))
+    assert len(ours | theirs) == 2 * len(large.experiment.trajectories)
+    for k, part in enumerate(parts):
+        own = slice(k * rows, (k + 1) * rows)
+        there = part.displacement(slice(None))
+        np.testing.assert_allclose(both.displacement(own), there, atol=2e-6 * np.abs(there).max())
+        np.testing.assert_array_equal(both.experiment.force[own], part.experiment.force)
+        assert both.contact is not None
+        assert part.contact is not None
+        np.testing.assert_array_equal(both.contact.centre[own], part.contact.centre)
+        bears = part.contact.basis.decode(part.contact.coefficients)
+        found = both.contact.basis.decode(both.contact.coefficients[own])
+        np.testing.assert_allclose(found, bears, atol=2e-6 * np.abs(bears).max())
+        for trial in range(part.experiment.trials):
+            name = both.experiment.trial_name(trial + k * part.experiment.trials)
+            assert name == part.experiment.trial_name(trial).replace(" ", f" {'ab'[k]}/")
+    few = join_mixed(parts, ["a", "b"], modes=2, force_modes=1)
+    assert len(few.basis.modes) == 2
+    assert few.basis.loss_mean > both.basis.loss_mean
+
+
+def test_parts_that_do_not_fit_together_are_refused(large: MixedDataset, tmp_path: Path) -> None:
+    faces = replace(large.mesh, outer_faces=large.mesh.outer_faces[:, ::-1].copy())
+    with pytest.raises(DatasetError, match="b has another mesh than a"):
+        join_mixed([large, replace(large, mesh=faces)], ["a", "b"], modes=2, force_modes=1)
+    own = replace(large.experiment, provenance=replace(large.experiment.provenance, licence="mine"))
+    with pytest.raises(DatasetError, match="only one of them knows"):
+        join_mixed([large, replace(large, contact=None)], ["a", "b"], modes=2, force_modes=1)
+    with pytest.raises(DatasetError, match="licences differ"):
+        join_mixed([large, replace(large, experiment=own)], ["a", "b"], modes=2, force_modes=1)
+
+    files = [tmp_path / folder / "mixed.h5" for folder in ("one", "two")]
+    for file in files:
+        file.parent.mkdir()
+        write_mixed(file, large)
+    out, command = tmp_path / "both.h5", ["join", *map(str, files)]
+    twice = CliRunner().invoke(data_app, [*command, str(files[0]), str(out)])
+    assert isinstance(twice.exception, DatasetError)
+    assert "parts are called one, two, one" in str(twice.exception)
+    assert not out.exists()
+    done = CliRunner().invoke(data_app, [*command, str(out)])
+    assert done.exit_code == 0, done.output
+    assert {name.split("/")[0] for name in read_mixed(out).experiment.trajectories} == {
+        "one",
+        "two",
+    }
+    again = CliRunner().invoke(data_app, [*command, str(out)])
+    assert "both.h5 exists" in str(again.exception)
+
+
+def test_joined_features_keep_presses_apart(press_data: Callable[..., FeatureDataset]) -> None:
+    one, other = press_data(3, 20, 1), press_data(2, 20, 2)
+    other = replace(other, sensor_names=("second",))
+    both = joined([one, other])
+    assert len(np.unique(both.group)) == 5
+    assert both.sensor_names == ("finger", "second")
+    np.testing.assert_array_equal(both.sensor, np.repeat([0, 1], [60, 40]))
+    np.testing.assert_array_equal(both.electrodes[60:], other.electrodes)
+    same = joined([one, press_data(2, 20, 2)])
+    assert same.sensor_names == ("finger",)
+    with pytest.raises(DatasetError, match="does not say contact_location"):
+        joined([one, replace(other, contact_location=None)])
+    paid = replace(other, provenance=replace(other.provenance, licence="other"))
+    with pytest.raises(DatasetError, match="licences differ"):
+        joined([one, paid])

@@ -1,0 +1,183 @@
+"""Mixed data sets of several fingertips as one: the same mesh, fields in common modes.
+
+Skins of other thickness and fill have other positions, but the same nodes and faces. So a field,
+which is a displacement of each node, means the same on all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate_training.datasets.basis import Blocks, FieldEncoder, fit_basis
+from palpate_training.datasets.container import Provenance, joined_provenance
+from palpate_training.datasets.experiment import (
+    ExperimentDataset,
+    FieldBasis,
+    FloatArray,
+    MixedDataset,
+    SimulatedContact,
+    content_sha256,
+    read_mixed,
+    write_mixed,
+)
+
+_ROWS = 256
+"""Rows whose fields are in memory at once."""
+
+Fields = Sequence[tuple[FieldBasis, FloatArray]]
+"""Bases, each with the coefficients (N, K) of the rows that it holds."""
+
+
+def join_files(
+    paths: Sequence[Path], out: Path, *, modes: int, force_modes: int, command: str
+) -> MixedDataset:
+    """Write mixed data sets as one, whole or not at all; parts are called as their files.
+
+    Where files of several folders have the same name, parts are called as the folders.
+
+    Raises:
+        DatasetError: A file is missing, damaged or no mixed data set, ``out`` exists, two parts
+            have the same name, the disk refuses, or as in ``join_mixed``.
+    """
+    if out.exists():
+        raise DatasetError(f"{out} exists", remedy="remove it, or give another name")
+    names = [path.stem for path in paths]
+    if len(set(names)) < len(names):
+        names = [path.resolve().parent.name for path in paths]
+    if len(set(names)) < len(names):
+        raise DatasetError(
+            f"parts are called {', '.join(names)}",
+            remedy="give files, or folders of them, different names",
+        )
+    joined = join_mixed(
+        [read_mixed(path) for path in paths],
+        names,
+        modes=modes,
+        force_modes=force_modes,
+        command=command,
+    )
+    write_mixed(out, joined)
+    return joined
+
+
+def join_mixed(
+    parts: Sequence[MixedDataset],
+    names: Sequence[str],
+    *,
+    modes: int,
+    force_modes: int,
+    command: str = "",
+) -> MixedDataset:
+    """Put mixed data sets together; what the common modes lose is beside the given fields.
+
+    Args:
+        parts: At least one; all with contact forces, or none.
+        names: Of each part; trajectories are called after it: presses of different fingertips may
+            have the same names.
+        modes: Of the displacement, at most.
+        force_modes: Of the contact forces.
+        command: For provenance.
+
+    Returns:
+        Its mesh is the first part's.
+
+    Raises:
+        DatasetError: They are of different meshes, know different things, or differ in licence.
+    """
+    first = parts[0]
+    for name, part in zip(names, parts, strict=True):
+        same = part.mesh.nodes.shape == first.mesh.nodes.shape and np.array_equal(
+            part.mesh.outer_faces, first.mesh.outer_faces
+        )
+        if not same or (part.contact is None) != (first.contact is None):
+            raise DatasetError(
+                f"{name} has another mesh than {names[0]}, or only one of them knows how the"
+                " indenter bears on the skin",
+                remedy="join data sets that were made with one edge of the mesh",
+            )
+    apart = max(float(np.abs(part.mesh.nodes - first.mesh.nodes).max()) for part in parts)
+    basis, coefficients = _recoded([(one.basis, one.coefficients) for one in parts], modes)
+    contacts = [part.contact for part in parts if part.contact is not None]
+    contact = None
+    if contacts:
+        of_forces, numbers = _recoded([(c.basis, c.coefficients) for c in contacts], force_modes)
+        contact = SimulatedContact(
+            centre=np.concatenate([one.centre for one in contacts]),
+            normal=np.concatenate([one.normal for one in contacts]),
+            coefficients=numbers,
+            basis=of_forces,
+        )
+    where = joined_provenance(
+        [part.experiment.provenance for part in parts], [*map(content_sha256, parts)], command
+    )
+    where = replace(
+        where,
+        notes=f"{where.notes}; nodes are those of {names[0]}, the others' up to"
+        f" {apart * 1e3:.2f} mm away; losses of fields are beside theirs",
+    )
+    return MixedDataset(
+        experiment=join_experiments([part.experiment for part in parts], names, where),
+        simulated_force=np.concatenate([part.simulated_force for part in parts]),
+        coefficients=coefficients,
+        basis=basis,
+        mesh=first.mesh,
+        contact=contact,
+    )
+
+
+def join_experiments(
+    parts: Sequence[ExperimentDataset], names: Sequence[str], provenance: Provenance
+) -> ExperimentDataset:
+    """Put experiments together; units of the same name are the same."""
+    units = tuple(dict.fromkeys(unit for part in parts for unit in part.unit_names))
+    unit, trajectory, trial = [], [], []
+    trajectories = trials = 0
+    for part in parts:
+        unit.append(np.array([units.index(one) for one in part.unit_names])[part.trial_unit])
+        trajectory.append(part.trial_trajectory + trajectories)
+        trial.append(part.trial + trials)
+        trajectories, trials = trajectories + len(part.trajectories), trials + part.trials
+
+    def stacked(name: str) -> npt.NDArray[np.float32]:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    return ExperimentDataset(
+        unit_names=units,
+        trajectories=tuple(
+            f"{name}/{one}"
+            for name, part in zip(names, parts, strict=True)
+            for one in part.trajectories
+        ),
+        indenters=tuple(one for part in parts for one in part.indenters),
+        trial_unit=np.concatenate(unit).astype(np.int32),
+        trial_trajectory=np.concatenate(trajectory).astype(np.int32),
+        trial_rest=stacked("trial_rest"),
+        trial=np.concatenate(trial).astype(np.int32),
+        travel_m=stacked("travel_m"),
+        tared=stacked("tared"),
+        force=stacked("force"),
+        location=stacked("location"),
+        provenance=provenance,
+    )
+
+
+def _recoded(parts: Fields, count: int) -> tuple[FieldBasis, FloatArray]:
+    """Common modes of fields, and the coefficients of all rows."""
+    basis = fit_basis(_blocks(parts), count=count)
+    encode = FieldEncoder(basis)
+    return basis, np.concatenate([encode(block) for block in _blocks(parts)()])
+
+
+def _blocks(parts: Fields) -> Blocks:
+    def blocks() -> Iterator[FloatArray]:
+        for basis, coefficients in parts:
+            for first in range(0, len(coefficients), _ROWS):
+                yield basis.decode(coefficients[first : first + _ROWS])
+
+    return blocks
