@@ -35,6 +35,7 @@ from palpate_training.systems.transfer import WAYS, ForceTransfer, Way
 from palpate_training.tasks.population import (
     ONNX,
     REPORT,
+    fingertips_of,
     points_of,
     split_population,
     targets_of,
@@ -332,3 +333,39 @@ def test_the_command_writes_report_and_weights(stored: Path, tmp_path: Path) -> 
     assert result.exit_code == 0
     assert "unseen specimen unseen press" in result.output
     assert load_population_net(tmp_path / WEIGHTS).config.width == 16
+
+
+def test_where_fingertips_differ_some_are_never_met() -> None:
+    """Ten skins of three specimens; each press is executed on two of one skin."""
+    rng = np.random.default_rng(3)
+    presses = [(skin, press) for skin in range(10) for press in range(8)]
+    group = np.repeat(np.arange(len(presses)), 4)
+    sensor = np.concatenate(
+        [3 * skin + np.repeat(rng.choice(3, 2, replace=False), 2) for skin, _ in presses]
+    )
+    force = np.tile([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], (2 * len(presses), 1))
+    one = replace(
+        population(),
+        **{
+            name: np.zeros((len(group), 19), kind)
+            for name, kind in (("electrodes", np.uint16), ("baseline", np.float32))
+        },
+        force=force.astype(np.float32),
+        group=group.astype(np.int32),
+        block=group.astype(np.int32),
+        sensor=sensor.astype(np.int32),
+        sensor_names=tuple(f"unit-{number:03d}" for number in range(30)),
+        contact_location=None,
+        in_contact=None,
+    )
+    skin = fingertips_of(one)
+    np.testing.assert_array_equal(np.unique(skin, return_inverse=True)[1], sensor // 3)
+    split = split_population(one, seed=0)
+    never = np.unique(skin[split.cells["unseen_specimen_unseen_press"]])
+    assert len(never) == 2
+    assert not np.isin(skin[~split.cells["unseen_specimen_unseen_press"]], never).any()
+    # A specimen that is not met may have the skin of one that is.
+    new = split.cells["unseen_specimen_seen_press"]
+    assert not np.isin(one.sensor[split.train], one.sensor[new]).any()
+    assert np.isin(skin[new], skin[split.train]).all()
+    assert not np.isin(skin[split.train], skin[split.validation[1]]).any()

@@ -4,7 +4,8 @@ Specimens are dealt to those that are learned from, those that the training stop
 are unseen; points of the skin likewise, with all presses there. Reported are four cells: seen and
 unseen specimens by seen and unseen presses; beside a constant and a ridge regression on the same
 inputs; and the unseen cell again with all electrodes off by the same, as a fluid that has warmed
-since the tare.
+since the tare. Of many fingertips some are unseen, too: the last cell is theirs, with all their
+specimens and presses.
 
     palpate train population features.h5 runs/population
 """
@@ -21,6 +22,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from palpate.errors import BundleError, ConfigError, DatasetError
 from palpate.files.atomic import written_whole
@@ -64,6 +67,9 @@ STOPPED_SPECIMENS = 0.05
 UNSEEN_POINTS = 0.1
 STOPPED_POINTS = 0.05
 
+FINGERTIPS_LEAST = 8
+"""With fewer fingertips only specimens are dealt: too few skins would be left to learn from."""
+
 SAME_POINT_M = 3e-3
 """Presses that follow one another and touch within this are taken for presses of one point: of the
 twin's 36 pairs of presses that are, 34 do."""
@@ -88,8 +94,9 @@ class PopulationSplit:
         train: Rows to learn from.
         validation: Sets of rows to stop on: specimens that are learned from, and others.
         cells: Rows of each cell that is reported, by name.
-        specimens: Names of the unseen specimens.
+        specimens: Names of the unseen specimens, of unseen fingertips and of others.
         points: Number of points that were dealt.
+        fingertips: Number of fingertips, which were dealt if they are ``FINGERTIPS_LEAST``.
     """
 
     train: Mask
@@ -97,10 +104,11 @@ class PopulationSplit:
     cells: dict[str, Mask]
     specimens: tuple[str, ...]
     points: int
+    fingertips: int
 
 
 def split_population(data: FeatureDataset, *, seed: int) -> PopulationSplit:
-    """Deal specimens and points.
+    """Deal specimens, points, and fingertips where there are many.
 
     Raises:
         DatasetError: There are fewer than three specimens or points, or a side has no rows.
@@ -109,12 +117,22 @@ def split_population(data: FeatureDataset, *, seed: int) -> PopulationSplit:
     specimen = _dealt(rng, data.sensor, UNSEEN_SPECIMENS, STOPPED_SPECIMENS, "specimens")
     point = points_of(data)
     press = _dealt(rng, point, UNSEEN_POINTS, STOPPED_POINTS, "points")
-    train = (specimen == _LEARNED) & (press == _LEARNED)
-    validation = tuple((specimen == side) & (press == _STOPPED) for side in (_LEARNED, _STOPPED))
+    never = (specimen == _UNSEEN) & (press == _UNSEEN)
+    other = (specimen == _STOPPED) & (press == _STOPPED)
+    known = np.ones(len(data), bool)
+    fingertip = fingertips_of(data)
+    fingertips = len(np.unique(fingertip))
+    if fingertips >= FINGERTIPS_LEAST:  # presses of one that is never met are never met either
+        tip = _dealt(rng, fingertip, UNSEEN_SPECIMENS, STOPPED_SPECIMENS, "fingertips")
+        never, other, known = tip == _UNSEEN, tip == _STOPPED, tip == _LEARNED
+    learned, unseen = (known & (specimen == side) for side in (_LEARNED, _UNSEEN))
+    train = learned & (press == _LEARNED)
+    validation = (learned & (press == _STOPPED), other)
     cells = {
-        f"{name}_specimen_{what}_press": (specimen == one) & (press == other)
-        for name, one in (("seen", _LEARNED), ("unseen", _UNSEEN))
-        for what, other in (("seen", _LEARNED), ("unseen", _UNSEEN))
+        "seen_specimen_seen_press": train,
+        "seen_specimen_unseen_press": learned & (press == _UNSEEN),
+        "unseen_specimen_seen_press": unseen & (press == _LEARNED),
+        "unseen_specimen_unseen_press": never,
     }
     touched = np.linalg.norm(data.force, axis=1) >= TOUCHED_N
     sides = {"train": train, "validation": validation[0], **cells}
@@ -128,8 +146,9 @@ def split_population(data: FeatureDataset, *, seed: int) -> PopulationSplit:
         train,
         tuple(rows for rows in validation if (rows & touched).any()),
         cells,
-        tuple(data.sensor_names[i] for i in np.unique(data.sensor[specimen == _UNSEEN])),
+        tuple(data.sensor_names[i] for i in np.unique(data.sensor[unseen | never])),
         len(np.unique(point)),
+        fingertips,
     )
 
 
@@ -157,6 +176,21 @@ def _dealt(
     side[dealt[:unseen]] = _UNSEEN
     side[dealt[unseen : unseen + stopped]] = _STOPPED
     return side[number]
+
+
+def fingertips_of(data: FeatureDataset) -> npt.NDArray[np.int64]:
+    """Fingertip of each row, shape ``(N,)``: specimens that executed one trajectory have one skin.
+
+    A simulated trajectory is of one skin, and a features file has one group for it. Where no two
+    specimens share a trajectory each counts as a fingertip.
+    """
+    groups, group = np.unique(data.group, return_inverse=True)
+    sensors = len(data.sensor_names)
+    pairs = np.unique(np.stack([data.sensor, sensors + group]), axis=1)
+    size = sensors + len(groups)
+    shares = coo_matrix((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=(size, size))
+    found: npt.NDArray[np.int64] = connected_components(shares, directed=False)[1][data.sensor]
+    return found
 
 
 def points_of(data: FeatureDataset) -> npt.NDArray[np.int64]:
@@ -234,6 +268,7 @@ def train_population(
         "rows": {"all": len(data), "train": int(split.train.sum())},
         "presses": len(np.unique(data.group)),
         "points": split.points,
+        "fingertips": split.fingertips,
         "specimens": len(data.sensor_names),
         "unseen_specimens": split.specimens,
         "quantities": quantities,
