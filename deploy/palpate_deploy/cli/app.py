@@ -227,6 +227,85 @@ def calibrate(
     )
 
 
+_DeviceWords = "'DRIVER KEY=VALUE ...'"
+
+
+@app.command(
+    epilog=example(
+        "palpate new-station",
+        "palpate new-station --biotac 'biotac_can channel=can0' --serial BT01 "
+        "--wrench 'wrench_rdt product=ati_net_ft host=192.168.1.1' --start",
+    )
+)
+def new_station(
+    name: Annotated[str, typer.Option(help="Name of the station and of its profile.")] = "lab",
+    biotac: Annotated[
+        str | None,
+        typer.Option(metavar=_DeviceWords, help="The BioTac, as `palpate gateway probe` reads it."),
+    ] = None,
+    wrench: Annotated[
+        str | None, typer.Option(metavar=_DeviceWords, help="The force/torque sensor, likewise.")
+    ] = None,
+    pose: Annotated[
+        str | None, typer.Option(metavar=_DeviceWords, help="The robot's poses, likewise.")
+    ] = None,
+    serial: Annotated[
+        str, typer.Option(help="Serial number of the BioTac, if it sends none.")
+    ] = "",
+    listen: Annotated[
+        str, typer.Option(metavar="ENDPOINT", help="Where the station's router listens.")
+    ] = DEFAULT_CONNECT,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The profile; default: NAME.toml.")
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Ask nothing; take the only BioTac that is found.")
+    ] = False,
+    anyway: Annotated[
+        bool, typer.Option("--anyway", help="Write the profile although a device is silent.")
+    ] = False,
+    start: Annotated[
+        bool,
+        typer.Option(
+            "--start", help="Go on: run the station, tare, look, calibrate, serve; until Ctrl-C."
+        ),
+    ] = False,
+    presses: Annotated[int, typer.Option(min=6, help="Presses to calibrate with.")] = 20,
+    look_s: Annotated[float, typer.Option(min=0, help="How long the signals are shown [s].")] = 5.0,
+) -> None:
+    """Find what is connected, try it, and write a profile; with --start as far as estimates.
+
+    Run it again to go on: a profile that is there is kept, a station that runs is used, a finger
+    with a bundle of its own keeps it.
+    """
+    from palpate_deploy.station.new_station import (
+        FINGER,
+        INDENTER,
+        WRENCH_SENSOR,
+        StationWanted,
+        make_station,
+        next_commands,
+    )
+
+    named = {FINGER: biotac, WRENCH_SENSOR: wrench, INDENTER: pose}
+    wanted = StationWanted(
+        name,
+        Path(f"{name}.toml") if out is None else out,
+        {sensor: words for sensor, words in named.items() if words is not None},
+        serial,
+        listen,
+        yes=yes,
+        anyway=anyway,
+    )
+    make_station(wanted)
+    if not start:
+        print(next_commands(wanted))
+        return
+    from palpate_deploy.station.first_hour import WalkOrder, walk
+
+    walk(WalkOrder(wanted.path, presses, look_s, Path("runs/calibrate")))
+
+
 @app.command(epilog=example("palpate demo --seconds 20 --out runs/demo"))
 def demo(
     seconds: Annotated[

@@ -23,7 +23,7 @@ from palpate.heartbeat import ServiceManager
 from palpate.messages import ServiceState, Status, SupervisedProcess
 from palpate.process import Closing, ProcessUsage
 from palpate_deploy.station.host import join
-from palpate_deploy.station.lifetime import stop_on_signals
+from palpate_deploy.station.lifetime import end_with_parent, stop_on_signals
 from palpate_deploy.station.logs import cell, print_error
 from palpate_deploy.station.processes import check_packages, ended_error
 from palpate_deploy.station.profile import Profile
@@ -56,6 +56,7 @@ def run_up(profile: Profile, name: str) -> int:
     console = Console()
     manager = ServiceManager()
     stop = stop_on_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    end_with_parent()
     with Supervisor(profile, name) as supervisor:
         console.print(
             f"station {profile.station!r} starts: {', '.join(profile.processes)}\n"

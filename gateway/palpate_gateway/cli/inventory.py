@@ -30,7 +30,7 @@ _DETECT_S = 2.0
 def list_command(*, as_json: bool) -> None:
     """Print drivers, serial ports and CAN interfaces."""
     drivers = [_about(name) for name in driver_names()]
-    found = {"drivers": drivers, "serial_ports": _serial_ports(), "can_interfaces": _can_buses()}
+    found = {"drivers": drivers, "serial_ports": serial_ports(), "can_interfaces": can_buses()}
     if as_json:
         typer.echo(json.dumps(found, indent=2))
         return
@@ -73,7 +73,7 @@ def _about(name: str) -> dict[str, str]:
     }
 
 
-def _serial_ports() -> list[dict[str, str]] | str:
+def serial_ports() -> list[dict[str, str]] | str:
     """Ports with their names by id; a message if they cannot be listed."""
     try:
         list_ports = require("serial.tools.list_ports", extra="gateway")
@@ -88,7 +88,7 @@ def _serial_ports() -> list[dict[str, str]] | str:
     return ports
 
 
-def _can_buses() -> list[dict[str, str]] | str:
+def can_buses() -> list[dict[str, str]] | str:
     """Adapters that python-can finds; a message if they cannot be listed."""
     try:
         can = require("can", extra="gateway")

@@ -65,11 +65,12 @@ def text_keys(options_class: type[StrictConfig]) -> frozenset[str]:
     return frozenset(name for name, field in fields if field.annotation is str)
 
 
-def sensor_toml(name: str, driver: str, options: Mapping[str, Any]) -> str:
-    """The table of one sensor in a profile."""
-    lines = ["[[gateway.sensors]]", f"name = {_toml(name)}", f"driver = {_toml(driver)}", ""]
+def sensor_toml(name: str, driver: str, options: Mapping[str, Any], *, of: str = "") -> str:
+    """The table of one sensor in a profile; ``of`` names the finger that it belongs to."""
+    lines = ["[[gateway.sensors]]", f"name = {toml_value(name)}", f"driver = {toml_value(driver)}"]
+    lines += [f"of = {toml_value(of)}", ""] if of else [""]
     lines += ["[gateway.sensors.options]"]
-    lines += [f"{key} = {_toml(value)}" for key, value in options.items()]
+    lines += [f"{key} = {toml_value(value)}" for key, value in options.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -80,14 +81,15 @@ def command_words(options: Mapping[str, Any], prefix: str = "") -> str:
         if isinstance(value, Mapping):
             words.append(command_words(value, f"{prefix}{key}."))
         else:
-            text = value if isinstance(value, str) else _toml(value)
+            text = value if isinstance(value, str) else toml_value(value)
             words.append(shlex.quote(f"{prefix}{key}={text}"))
     return " ".join(words)
 
 
-def _toml(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """A value as TOML in one line."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + " }"
+        return "{ " + ", ".join(f"{key} = {toml_value(one)}" for key, one in value.items()) + " }"
     # JSON writes strings, numbers and booleans as TOML does.
     return json.dumps(value, ensure_ascii=False)
 
