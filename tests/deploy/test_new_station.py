@@ -232,6 +232,12 @@ class TestNothingIsWritten:
         assert done.exit_code == USAGE
         assert "there is no folder nowhere" in done.output
 
+    def test_by_a_name_that_no_command_would_take(self, lab: Path) -> None:
+        done = run("--biotac", VIRTUAL, "--out", "mine")
+        assert done.exit_code == USAGE
+        assert "--out mine.toml" in done.output
+        assert not list(lab.iterdir())
+
     def test_by_a_disk_that_is_full(self, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def full(*_: object) -> None:
             raise OSError(28, "No space left on device")
@@ -311,6 +317,22 @@ class TestQuestions:
         (finger,) = load_profile(lab / "lab.toml").gateway.sensors
         assert finger.options == {"model": "formula", "seed": 3}
 
+    def test_choices_are_what_the_host_has(
+        self, lab: Path, host: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        host(can=["can7", "can8"], ports=["/dev/ttyACM3"])
+        terminal = SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True))
+        monkeypatch.setattr(new_station, "sys", terminal)
+        finger, wrench, pose, serial = "2\n1\n", "6\n127.0.0.1\n", "1\n", "BT09\n"
+        answers = finger + wrench + pose + serial
+        done = CliRunner().invoke(app, ["new-station", "--anyway"], input=answers)
+        assert done.exit_code == OK, done.output
+        assert "3  behind our bridge: /dev/ttyACM3" in done.output
+        (biotac, force) = load_profile(lab / "lab.toml").gateway.sensors
+        assert biotac.driver == "biotac_can"
+        assert biotac.options == {"channel": "can8", "port": 1, "serial": "BT09"}
+        assert (force.driver, force.options["host"]) == ("wrench_kms40", "127.0.0.1")
+
     def test_ctrl_c_leaves_nothing(self, lab: Path) -> None:
         said, status = answered(b"\x03")
         assert status not in (OK, None), said
@@ -348,6 +370,7 @@ def emulated(new_port: Callable[[], int]) -> Any:
         yield on_can(port)
 
 
+@pytest.mark.slow
 def test_without_a_force_sensor_it_says_so_and_all_ends_with_it(
     emulated: str,
     lab: Path,

@@ -25,7 +25,13 @@ from palpate.messages import COUNTS_MAX
 from palpate.process import check_installed
 from palpate_deploy.station.profile import Profile, load_profile, parse_profile
 from palpate_gateway.cli.inventory import can_buses, serial_ports
-from palpate_gateway.cli.key_values import parse_key_values, sensor_toml, text_keys
+from palpate_gateway.cli.key_values import (
+    command_words,
+    parse_key_values,
+    sensor_toml,
+    text_keys,
+    toml_value,
+)
 from palpate_gateway.cli.streams import DeviceStreams, measure, text_of
 from palpate_gateway.device import BusDevice, Device
 from palpate_gateway.drivers import load_driver, make_device
@@ -118,6 +124,10 @@ def make_station(wanted: StationWanted) -> None:
         MissingExtraError: A device needs a package that is not installed.
     """
     check_name(wanted.name, "name")
+    if wanted.path.suffix != ".toml":
+        raise ConfigError(
+            f"{wanted.path} is no name for a profile", remedy=f"write --out {wanted.path}.toml"
+        )
     given = {sensor: _parsed(sensor, words) for sensor, words in wanted.devices.items()}
     if wanted.serial and FINGER in given:
         given[FINGER].options["serial"] = wanted.serial
@@ -200,7 +210,7 @@ def _unasked(given: Mapping[str, WantedDevice], *, yes: bool) -> list[WantedDevi
     if buses:
         raise ConfigError(
             f"{len(buses)} CAN interfaces are there: {', '.join(name for name, _ in buses)}",
-            remedy=f"say which: --biotac 'biotac_can channel={buses[0][1]['channel']}'",
+            remedy=f"say which: --biotac 'biotac_can {command_words(buses[0][1])}'",
         )
     listed = ", ".join(name for name, _ in ports)
     raise ConfigError(
@@ -427,7 +437,7 @@ def profile_text(wanted: StationWanted, probed: Sequence[ProbedDevice]) -> str:
         'processes = ["router", "gateway", "features", "recorder"]\n',
         "[router]\n"
         "# Robots and commands join here. For other hosts: tls/ADDRESS:PORT, and [link.tls].\n"
-        f'listen = ["{wanted.listen}"]\n',
+        f"listen = {toml_value([wanted.listen])}\n",
     ]
     for one in probed:
         device = one.device
@@ -439,7 +449,8 @@ def profile_text(wanted: StationWanted, probed: Sequence[ProbedDevice]) -> str:
                 "# `serial` tells this finger from others: a bundle is made for one of them.",
             ]
         elif device.sensor == WRENCH_SENSOR:
-            options = {**_MOUNT, **options}
+            if "mount" in load_driver(device.driver).options_class.model_fields:
+                options = {**_MOUNT, **options}
             comments += [
                 "# `of`: its readings belong to that finger. `mount`: what is fixed to its",
                 '# measuring side ("biotac" or "indenter"), and its axes and origin [m] in the',
