@@ -247,6 +247,32 @@ def cells_table(reports: list[dict[str, Any]]) -> str:
     return markdown_table(head, rows)
 
 
+def shots_table(reports: list[dict[str, Any]]) -> str:
+    """A row for each quantity: errors by number of known presses, where neither was met."""
+    tables = [report["cells"][list(CELLS)[-1]].get("shots", {}) for report in reports]
+    shots = sorted((key for key in tables[0] if key.isdigit()), key=int)
+    if not shots:
+        return ""
+
+    def mean(key: str, rival: str, figure: str) -> str:
+        return f"{np.mean([table[key][rival][figure] for table in tables]):.3g}"
+
+    rows = []
+    for figure, name in FIGURES.items():
+        factor = [mean(key, "one factor", figure) for key in shots[1:]]
+        moved = max(
+            table[shots[-1]][f"network, all {offset}"][figure]
+            for table in tables
+            for offset in ("+0.05", "-0.05")
+        )
+        own = [mean(key, "network", figure) for key in shots]
+        rows.append([name, *own, *(factor if "force" in figure else ["" for _ in factor]),
+                     f"{moved:.3g}"])  # fmt: skip
+    head = ["median error", *(f"{key} presses" for key in shots)]
+    head += [f"one factor, {key}" for key in shots[1:]]
+    return markdown_table([*head, f"{shots[-1]} presses, all off by 0.05"], rows)
+
+
 def show(value: float) -> str:
     """A number of a band."""
     return f"{value:,.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
@@ -277,6 +303,9 @@ def page(found: dict[str, Any], networks: dict[str, list[dict[str, Any]]]) -> st
     for name, reports in networks.items():
         seeds = f"{len(reports)} seed{'s' * (len(reports) > 1)}."
         text += [f"### {name}", "", seeds, "", cells_table(reports)]
+        shots = shots_table(reports)
+        if shots:
+            text += [SHOTS.format(**reports[0]["cells"][list(CELLS)[-1]]["shots"]), shots]
     return "\n".join([*text, "![network](population/network.png)", "", TOLD])
 
 
@@ -293,13 +322,19 @@ NETWORK = """## One network for all specimens
 
 `palpate train population` ({all:,} rows of {presses:,} presses, {train:,} of them learned from). It
 reads the change of the logarithm of each impedance since rest, and is told the specimen by its
-untouched electrodes (FiLM). {unseen} of {specimens} specimens and a tenth of the presses are in no
-training. Rows of at least 0.5 N.
+untouched electrodes and by presses of it, if some are known (FiLM). {unseen} of {specimens}
+specimens and a tenth of the presses are in no training. Rows of at least 0.5 N.
 
 *Ratio*: of a specimen that was not met to one that was, both on presses that were not met (goal
 1.2). The last three columns are of the cell where neither was seen: the network when all electrodes
 are off by 0.05 of a logarithm, as a fluid that has warmed since the tare (the worse of both signs),
 and rivals on the same inputs.
+"""
+
+SHOTS = """The same where some presses of the specimen are known: {specimens} specimens that were
+not met, {draws} draws of presses of each, tested on presses at other points, none of them in the
+training; the same {rows:,} rows for any number of presses. *One factor*: what the network estimates
+without a press, times the factor that fits the known presses.
 """
 
 TOLD = """## What it says

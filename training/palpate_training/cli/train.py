@@ -337,10 +337,19 @@ def train_population_command(
     ] = 1.0,
     common_sd: Annotated[
         float, typer.Option(min=0.0, help="Random offset of all electrodes in training [log Ohm].")
-    ] = 0.05,
-    gain_spread: GainSpread = GAIN_SPREAD,
+    ] = 0.03,
+    gain_spread: GainSpread = 0.03,
+    stiffness_sd: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            help="Log-normal spread of all forces of a specimen whose presses are known, in training.",
+        ),
+    ] = 0.3,
 ) -> None:
-    """One network for a population, tested on specimens and presses that it has not met.
+    """One network for a population, told a specimen by its rest and by up to ten presses of it.
+
+    It is tested on specimens and presses that it has not met.
 
     palpate train population features.h5 runs/population --device cuda
     """
@@ -349,7 +358,7 @@ def train_population_command(
 
     config = PopulationConfig(
         epochs=epochs, batch_rows=batch_rows, width=width, blocks=blocks,
-        common=common, common_sd=common_sd, gain_sd=gain_spread,
+        common=common, common_sd=common_sd, gain_sd=gain_spread, stiffness_sd=stiffness_sd,
     )  # fmt: skip
     with _progress() as progress:
         bar = progress.add_task("population", total=epochs)
@@ -358,11 +367,18 @@ def train_population_command(
             on_epoch=lambda: progress.advance(bar),
         )  # fmt: skip
     for name, cell in facts["cells"].items():
-        rivals = [key for key, value in cell.items() if isinstance(value, dict)]
+        rivals = [key for key, value in cell.items() if isinstance(value, dict) and key != "shots"]
         table = Table("", *rivals, title=f"{name.replace('_', ' ')}: {cell['presses']} presses")
         for key in facts["ratio_unseen_to_seen_specimen"]:
             table.add_row(key, *(f"{cell[rival].get(key, float('nan')):.3f}" for rival in rivals))
         console.print(table)
+        shots = {key: one["network"] for key, one in cell["shots"].items() if key.isdigit()}
+        if shots:
+            table = Table("", *(f"{key} presses" for key in shots), title="the same, presses known")
+            for key in shots["0"]:
+                if key != "ci95":
+                    table.add_row(key, *(f"{one[key]:.3f}" for one in shots.values()))
+            console.print(table)
     console.print(f"wrote {out}")
 
 

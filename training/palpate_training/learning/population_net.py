@@ -1,12 +1,17 @@
-"""One network for all specimens of a population, told which by its untouched electrodes.
+"""One network for all specimens of a population: told which by its rest, and by presses of it.
 
 What an electrode reads on touch is the change of the logarithm of its impedance since rest; what
-that means depends on the specimen, and its rest says something about that. So the layers read the
-change, and are modulated by the rest (FiLM: a gain and an offset of every hidden value).
+that means depends on the specimen. Its rest says something about that, and presses with a known
+force say more, as many as there are, also none (``press_set``). So the layers read the change, and
+are modulated by the rest and by the code of the presses (FiLM: a gain and an offset of every hidden
+value); besides, the code multiplies the force by one number.
+
+A press is read beside what the network makes of it without any: that the forces of a specimen are
+wrong by one factor then lies open.
 
 Fluids warm, and a tare is never of the same moment as a touch: that moves all electrodes alike. So
-what they have in common is an input of its own, and training moves it at random; besides, every
-electrode of a training row gets a gain and an offset of its own.
+what they have in common is an input of its own, and training moves it at random
+(``population_fit``).
 """
 
 from __future__ import annotations
@@ -28,24 +33,25 @@ from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.features import ELECTRODES
-from palpate_training.learning.electrode_nets import MIRROR_AXES, NOISE_COUNTS, log_impedance
-from palpate_training.learning.fit import FitConfig, OnEpoch, fit
-from palpate_training.learning.networks import predict
+from palpate_training.learning.electrode_nets import MIRROR_AXES, log_impedance
+from palpate_training.learning.fit import FitConfig
+from palpate_training.learning.press_set import INPUTS, CalibrationPresses, PressLayers
 
 FloatArray = npt.NDArray[np.float32]
-
-INPUTS = 2 * ELECTRODES
-"""Changes of the logarithms of the impedance since rest, then these logarithms at rest."""
 
 WEIGHTS = "population.npz"
 """Where ``palpate train population`` leaves the network in its folder."""
 
 _READ = 2 * (ELECTRODES + 1)
-"""What the layers read of them: changes less their mean, that mean, and the same of the rest."""
+"""What the layers read of inputs: changes less their mean, that mean, and the same of the rest."""
+
+_READ_OF_PRESS = _READ + 8
+"""What is read of a row of a press: that, the force's direction, the logarithm of its magnitude,
+and by what both differ from the estimate without any press."""
 
 _SMALLEST_SD = 1e-6
-_SMOOTH = 1e-4  # of a normalised distance's square, so that its root has a slope at zero
-_FORMAT = "palpate.population-net/1"
+_SMALLEST_N = 0.1
+_FORMAT = "palpate.population-net/2"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +61,9 @@ class PopulationConfig(FitConfig):
     Attributes:
         width: Of the residual layers.
         blocks: Residual blocks, of two layers each.
-        rest_width: Hidden values between the rest and what it modulates.
+        rest_width: Hidden values between rest and code, and what they modulate.
+        press_width: Of the layers that read rows of calibration presses.
+        code: Values that calibration presses are summed up in.
         common: Share of what the electrodes have in common that is read; with 0 an offset of all
             of them changes nothing.
         common_sd: Of a training row, standard deviation of the offset of all electrodes.
@@ -63,6 +71,8 @@ class PopulationConfig(FitConfig):
         gain_sd: Of each electrode, standard deviation of the logarithm of its gain.
         rest_sd: The same of what each electrode at rest is off by; keeps specimens of the training
             from being known by heart.
+        stiffness_sd: Standard deviation of the logarithm of the factor of all forces of a specimen
+            whose presses are known: a skin as thick but stiffer, which only a press can tell.
         force_power: Errors of forces count over ``FORCE_FLOOR_N`` plus the magnitude to this power.
     """
 
@@ -73,20 +83,20 @@ class PopulationConfig(FitConfig):
     threads: int = 1
     width: int = 256
     blocks: int = 3
-    rest_width: int = 48
+    rest_width: int = 64
+    press_width: int = 128
+    code: int = 64
     common: float = 1.0
-    common_sd: float = 0.05
-    offset_sd: float = 0.01
-    gain_sd: float = 0.1
-    rest_sd: float = 0.05
-    force_power: float = 0.75
+    common_sd: float = 0.03
+    offset_sd: float = 0.005
+    gain_sd: float = 0.03
+    rest_sd: float = 0.02
+    stiffness_sd: float = 0.3
+    force_power: float = 0.5
 
 
-FORCE_FLOOR_N = 0.5
-
-
-class _RestLayers(nn.Module):
-    """Residual layers whose normalised values the rest multiplies and moves."""
+class _ModulatedLayers(nn.Module):
+    """Residual layers whose normalised values rest and code multiply and move."""
 
     def __init__(self, outputs: int, config: PopulationConfig) -> None:
         super().__init__()
@@ -100,29 +110,30 @@ class _RestLayers(nn.Module):
         last = nn.Linear(config.rest_width, 2 * width * config.blocks)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
-        self.rest = nn.Sequential(nn.Linear(half, config.rest_width), nn.SiLU(), last)
+        known = half + config.code
+        self.specimen = nn.Sequential(nn.Linear(known, config.rest_width), nn.SiLU(), last)
         self.head = nn.Linear(width, outputs)
 
-    def hidden(self, read: Tensor) -> Tensor:
-        """Values before the last layer, shape ``(N, width)``."""
+    def forward(self, read: Tensor, code: Tensor) -> Tensor:
         change, rest = read.chunk(2, dim=-1)
         hidden = self.first(change)
-        parts = self.rest(rest).chunk(2 * len(self.blocks), dim=-1)
+        modulation = self.specimen(torch.cat([rest, code], dim=-1))
+        parts = modulation.chunk(2 * len(self.blocks), dim=-1)
         for number, (norm, block) in enumerate(zip(self.norms, self.blocks, strict=True)):
             gain, offset = parts[2 * number : 2 * number + 2]
             hidden = hidden + block(norm(hidden) * (1.0 + gain) + offset)
-        return nn.functional.silu(hidden)
-
-    def forward(self, read: Tensor) -> Tensor:
-        estimate: Tensor = self.head(self.hidden(read))
+        estimate: Tensor = self.head(nn.functional.silu(hidden))
         return estimate
 
 
 class PopulationNet(nn.Module):
-    """Changes and rest ``(N, 38)`` -> force [N] and further quantities, ``(N, 3 Q)``.
+    """Changes and rest, and a code, ``(N, 38 + 2 C)`` -> force [N] and more, ``(N, 3 Q)``.
 
-    The estimate is the mean of that of a row and of its mirror image, so a mirrored row gets the
-    mirrored estimate.
+    The code comes from ``told``: of the presses as they are, then of their mirror image. Without
+    one, ``(N, 38)``, the network knows no press.
+
+    The estimate is the mean of that of a row and of its mirror image, the presses mirrored, too: so
+    a mirrored row of a specimen whose presses are mirrored gets the mirrored estimate.
 
     Args:
         quantities: Names of what it estimates, three values each; the first is the force.
@@ -140,30 +151,44 @@ class PopulationNet(nn.Module):
         super().__init__()
         self.quantities, self.config = tuple(quantities), config
         outputs = 3 * len(self.quantities)
-        order = np.concatenate([ELECTRODE_MIRROR, ELECTRODE_MIRROR + ELECTRODES])
+        codes = INPUTS + np.arange(2 * config.code)
+        order = np.concatenate(
+            [ELECTRODE_MIRROR, ELECTRODE_MIRROR + ELECTRODES, np.roll(codes, config.code)]
+        )
         signs = np.tile(MIRROR_AXES, len(self.quantities))
         # Made where the caller's default device is; constants are moved there with the weights.
         self.register_buffer("order", torch.from_numpy(order).long())
-        self.register_buffer("signs", torch.from_numpy(np.stack([np.ones_like(signs), signs]) / 2))
+        self.register_buffer("signs", torch.from_numpy(signs).float())
         self.register_buffer("input_mean", torch.zeros(_READ))
         self.register_buffer("input_sd", torch.ones(_READ))
         self.register_buffer("output_mean", torch.zeros(outputs))
         self.register_buffer("output_sd", torch.ones(outputs))
-        self.layers = _RestLayers(outputs, config)
+        self.layers = _ModulatedLayers(outputs, config)
+        self.presses = PressLayers(_READ_OF_PRESS, config.press_width, config.code)
+        self.factor = nn.Linear(config.code, 1, bias=False)
+        nn.init.zeros_(self.factor.weight)
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Estimates of rows as they are, and of their mirror images, averaged."""
+        inputs = self.with_code(inputs)
         mirrored = torch.index_select(inputs, -1, self.order)
-        both = torch.stack([inputs, mirrored], dim=1)
-        return (self.one_sided(both) * self.signs).sum(dim=1)  # (N, 2, O) -> (N, O)
+        both = torch.stack([inputs, mirrored], dim=1)[..., : INPUTS + self.config.code]
+        estimate = self.one_sided(both)  # (N, 2, O)
+        return (estimate[:, 0] + estimate[:, 1] * self.signs) / 2.0
+
+    def with_code(self, inputs: Tensor) -> Tensor:
+        """Inputs with the code of no press, where they have none."""
+        return nn.functional.pad(inputs, (0, len(self.order) - inputs.shape[-1]))
 
     def one_sided(self, inputs: Tensor) -> Tensor:
-        """Estimates of rows without their mirror images: what training sees."""
-        estimate: Tensor = self.layers(self.read(inputs)) * self.output_sd + self.output_mean
-        return estimate
+        """Without mirror images, ``(..., 38 + C)`` -> ``(..., O)``: what training sees."""
+        known, code = inputs[..., :INPUTS], inputs[..., INPUTS:]
+        estimate = self.layers(self.read(known), code) * self.output_sd + self.output_mean
+        force = estimate[..., :3] * torch.exp(self.factor(code))
+        return torch.cat([force, estimate[..., 3:]], dim=-1)
 
     def read(self, inputs: Tensor) -> Tensor:
-        """What the layers read of inputs, standardised, shape ``(N, 40)``."""
+        """What the layers read of changes and rest, standardised, shape ``(..., 40)``."""
         return (self.parts(inputs) - self.input_mean) / self.input_sd
 
     def parts(self, inputs: Tensor) -> Tensor:
@@ -173,35 +198,54 @@ class PopulationNet(nn.Module):
         common = self.config.common * mean
         return torch.cat([change - mean, common, rest - rest_mean, rest_mean], dim=-1)
 
-    def hidden(self, inputs: Tensor) -> Tensor:
-        """Values before the last layer, even and odd ones of a mirror image, ``(N, 2 width)``."""
-        mirrored = torch.index_select(inputs, -1, self.order)
-        one, other = (self.layers.hidden(self.read(rows)) for rows in (inputs, mirrored))
-        return torch.cat([one + other, one - other], dim=-1) / 2.0
+    def code_of(self, presses: Tensor) -> Tensor:
+        """Code of sets of rows ``(..., M, 42)``, shape ``(..., C)``."""
+        inputs, force, share = torch.split(presses, [INPUTS, 3, 1], dim=-1)
+        with torch.no_grad():
+            nothing = nn.functional.pad(inputs, (0, self.config.code))
+            guess = self.one_sided(nothing)[..., :3]
+        way, length = _polar(force)
+        guessed_way, guessed_length = _polar(guess)
+        differs = [way - guessed_way, length - guessed_length]
+        read = torch.cat([self.read(inputs), way, length, *differs], dim=-1)
+        code: Tensor = self.presses(read, share[..., 0])
+        return code
 
-    def normalise_from(self, inputs: Tensor, targets: FloatArray) -> None:
-        """Set the constants; where a quantity is not known it does not count."""
-        read = self.parts(inputs).double()
+    def mirrored_presses(self, presses: Tensor) -> Tensor:
+        """Mirror image of rows of presses, ``(..., 42)``."""
+        inputs, force, share = torch.split(presses, [INPUTS, 3, 1], dim=-1)
+        mirrored = torch.index_select(inputs, -1, self.order[:INPUTS])
+        return torch.cat([mirrored, force * self.signs[:3], share], dim=-1)
+
+    def told(self, inputs: FloatArray, presses: CalibrationPresses) -> FloatArray:
+        """Changes and rest ``(N, 38)`` of a specimen beside the code of presses of it.
+
+        Returns:
+            Shape ``(N, 38 + 2 C)``, for ``predict``.
+        """
+        with torch.inference_mode():
+            rows = presses.tensor().to(self.signs.device)
+            both = [self.code_of(one) for one in (rows, self.mirrored_presses(rows))]
+            code = torch.cat(both).cpu().numpy()
+        return np.hstack([inputs, np.tile(code, (len(inputs), 1))])
+
+    def normalise_from(self, inputs: FloatArray, targets: FloatArray) -> None:
+        """Set the constants from rows and mirror images; what is not known does not count."""
+        both = np.vstack([inputs, inputs[:, self.order[:INPUTS].cpu().numpy()]])
+        read = self.parts(torch.from_numpy(both)).double()
         self.input_mean.copy_(read.mean(dim=0))
         # Without a share of it, what is common stays zero whatever it is divided by.
         self.input_sd.copy_(read.std(dim=0).clamp(min=_SMALLEST_SD))
-        wanted = targets.astype(np.float64)
+        wanted = np.vstack([targets, targets * self.signs.cpu().numpy()]).astype(np.float64)
         spread = np.maximum(np.nanstd(wanted, axis=0), _SMALLEST_SD)
         self.output_mean.copy_(torch.from_numpy(np.nanmean(wanted, axis=0)))
         self.output_sd.copy_(torch.from_numpy(spread))
 
-    def noisy(self, inputs: Tensor) -> Tensor:
-        """Inputs with noise, gains and offsets, drawn for each row."""
-        config = self.config
-        change, rest = inputs.chunk(2, dim=-1)
-        share = torch.sigmoid(-(change + rest))  # counts over full scale
-        noise = NOISE_COUNTS / COUNTS_MAX * torch.randn_like(change)
-        noise = noise / (share * (1.0 - share)).clamp(min=1e-3)
-        offset = config.offset_sd * torch.randn_like(change)
-        common = config.common_sd * torch.randn_like(change[..., :1])
-        gain = torch.exp(config.gain_sd * torch.randn_like(change))
-        rest_noise = config.rest_sd * torch.randn_like(rest)
-        return torch.cat([gain * change + noise + offset + common, rest + rest_noise], dim=-1)
+
+def _polar(force: Tensor) -> tuple[Tensor, Tensor]:
+    """Direction of forces [N] and logarithm of their magnitude; tiny ones have nearly none."""
+    squares = torch.square(force).sum(dim=-1, keepdim=True) + _SMALLEST_N**2
+    return force * torch.rsqrt(squares), 0.5 * torch.log(squares)
 
 
 def inputs_of(counts: npt.NDArray[Any], rest: npt.NDArray[Any]) -> FloatArray:
@@ -213,146 +257,20 @@ def inputs_of(counts: npt.NDArray[Any], rest: npt.NDArray[Any]) -> FloatArray:
     return np.hstack([now - untouched, untouched]).astype(np.float32)
 
 
-def hidden_values(net: PopulationNet, inputs: FloatArray) -> npt.NDArray[np.float64]:
-    """Values before the last layer of rows ``(N, 38)``, as ``PopulationNet.hidden`` has them."""
-    with torch.inference_mode():
-        parts = [net.hidden(part) for part in torch.split(torch.from_numpy(inputs), 8192)]
-    return np.asarray(torch.cat(parts).numpy(), np.float64)
-
-
-def hidden_axes(net: PopulationNet, inputs: FloatArray, count: int) -> npt.NDArray[np.float64]:
-    """Principal axes of the hidden values of rows, first ``count`` even, then as many odd ones.
-
-    Returns:
-        Shape ``(2 width, 2 count)``.
-    """
-    some = hidden_values(net, inputs[:: max(1, len(inputs) // 2000)])
-    width = some.shape[1] // 2
-    axes = np.zeros((2 * width, 2 * count))
-    for kind in range(2):
-        own = slice(kind * width, (kind + 1) * width)
-        values = some[:, own] - (0.0 if kind else some[:, own].mean(axis=0))
-        principal = np.linalg.svd(values, full_matrices=False)[2]
-        axes[own, kind * count : (kind + 1) * count] = principal[:count].T
-    return axes
-
-
 class CountsGraph(nn.Module):
-    """Raw counts and untouched counts ``(N, 38)`` -> estimates: the network as it is shipped."""
+    """Raw and untouched counts and the code, ``(N, 38 + 2 C)`` -> estimates: as it is shipped.
+
+    Presses are encoded once for a finger, not for every frame; a code of zeros is that of none.
+    """
 
     def __init__(self, net: PopulationNet) -> None:
         super().__init__()
         self.net = net
 
-    def forward(self, counts: Tensor) -> tuple[Tensor]:
+    def forward(self, known: Tensor) -> tuple[Tensor]:
         """Estimates, shape ``(N, 3 Q)``."""
-        now, rest = (log_impedance(half) for half in counts.chunk(2, dim=-1))
-        return (self.net(torch.cat([now - rest, rest], dim=-1)),)
-
-
-@dataclass(frozen=True, slots=True)
-class PopulationRows:
-    """Rows to learn from or to stop on.
-
-    Attributes:
-        inputs: As ``inputs_of`` gives them, shape ``(N, 38)``.
-        targets: Force [N], then what only a contact has, shape ``(N, 3 Q)``; NaN where there is
-            none.
-    """
-
-    inputs: FloatArray
-    targets: FloatArray
-
-
-def fit_population(
-    train: PopulationRows,
-    validation: Sequence[PopulationRows],
-    quantities: Sequence[str],
-    *,
-    config: PopulationConfig,
-    seed: int = 0,
-    on_epoch: OnEpoch | None = None,
-) -> PopulationNet:
-    """Train on torch's default device; the weights of the best epoch are kept.
-
-    Args:
-        train: Rows to learn from; their mirror images are learned from, too.
-        validation: Sets of rows to stop on; the mean of their scores counts.
-        quantities: Names of the targets, three values each.
-        config: Settings.
-        seed: Of the weights, the order of the rows and the noise.
-        on_epoch: Called after each epoch, for a progress bar.
-    """
-    torch.manual_seed(seed)
-    with torch.device("cpu"):
-        net = PopulationNet(quantities, config)
-        order, signs = net.order.numpy(), np.tile(MIRROR_AXES, len(quantities))
-        inputs = np.vstack([train.inputs, train.inputs[:, order]])
-        targets = np.vstack([train.targets, train.targets * signs])
-        net.normalise_from(torch.from_numpy(inputs), targets)
-        sizes = sizes_of(train.targets)
-    fit(
-        _OneSided(net),
-        inputs,
-        targets,
-        loss_of=lambda estimate, truth: _loss(sizes, config.force_power, estimate, truth),
-        score_of=lambda _: float(
-            np.mean([score_of(predict(net, rows.inputs), rows.targets) for rows in validation])
-        ),
-        config=config,
-        augment=lambda batch, _: net.noisy(batch),
-        on_epoch=on_epoch,
-    )
-    return net.cpu().eval()
-
-
-class _OneSided(nn.Module):
-    """The network as it is trained: both sides of a finger are rows of their own."""
-
-    def __init__(self, net: PopulationNet) -> None:
-        super().__init__()
-        self.net = net
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        return self.net.one_sided(inputs)
-
-
-def sizes_of(targets: FloatArray) -> list[float]:
-    """Root mean square distance of each quantity from its mean."""
-    parts = np.split(targets.astype(np.float64), targets.shape[1] // 3, axis=1)
-    return [max(1e-9, float(np.sqrt(np.nansum(np.nanvar(part, axis=0))))) for part in parts]
-
-
-def _loss(sizes: Sequence[float], power: float, estimate: Tensor, wanted: Tensor) -> Tensor:
-    """Sum over the quantities of the mean distance: of a force over its magnitude, else spread."""
-    total = torch.zeros((), device=estimate.device)
-    parts = zip(torch.split(estimate, 3, dim=1), torch.split(wanted, 3, dim=1), strict=True)
-    for number, (guess, truth) in enumerate(parts):
-        known = ~torch.isnan(truth[:, 0])
-        error = torch.where(known[:, None], guess - torch.nan_to_num(truth), 0.0)
-        if number == 0:
-            magnitude = torch.linalg.vector_norm(torch.nan_to_num(truth), dim=1, keepdim=True)
-            error = error / (FORCE_FLOOR_N + magnitude) ** power
-        else:
-            error = error / sizes[number]
-        distance = torch.sqrt(torch.square(error).sum(dim=1) + _SMOOTH)
-        total = total + (distance * known).sum() / known.sum().clamp(min=1)
-    return total
-
-
-def score_of(estimate: FloatArray, targets: FloatArray) -> float:
-    """Force: median error over floor and magnitude; of all others over their spread; summed."""
-    total = 0.0
-    for number, size in enumerate(sizes_of(targets)):
-        part = slice(3 * number, 3 * number + 3)
-        if np.isnan(targets[:, part]).all():
-            continue
-        distance = np.linalg.norm(estimate[:, part] - targets[:, part], axis=1)
-        if number == 0:
-            distance = distance / (FORCE_FLOOR_N + np.linalg.norm(targets[:, part], axis=1))
-            size = 1.0
-        total += float(np.nanmedian(distance)) / size
-    return total
+        now, rest = (log_impedance(half) for half in known[:, :INPUTS].chunk(2, dim=-1))
+        return (self.net(torch.cat([now - rest, rest, known[:, INPUTS:]], dim=-1)),)
 
 
 def save_population_net(path: Path, net: PopulationNet) -> None:

@@ -28,36 +28,29 @@ from scipy.sparse.csgraph import connected_components
 from palpate.errors import BundleError, ConfigError, DatasetError
 from palpate.files.atomic import written_whole
 from palpate_training.datasets.features import (
-    ELECTRODES,
     OF_CONTACT,
     FeatureDataset,
     open_dataset,
 )
+from palpate_training.evaluation.population import Estimate, cell, draw_shots
 from palpate_training.learning import baselines
-from palpate_training.learning.metrics import (
-    FORCE_BINS_N,
-    angles,
-    drawn_medians,
-    force_errors,
-    interval,
-    location_errors,
+from palpate_training.learning.population_fit import (
+    TOUCHED_N,
+    PopulationRows,
+    StopRows,
+    fit_population,
 )
-from palpate_training.learning.networks import predict
 from palpate_training.learning.population_net import (
-    INPUTS,
     WEIGHTS,
     CountsGraph,
     PopulationConfig,
     PopulationNet,
-    PopulationRows,
-    fit_population,
     inputs_of,
     save_population_net,
 )
 
 FloatArray = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
-Estimate = Callable[[FloatArray], npt.NDArray[np.floating]]
 
 REPORT = "population.json"
 ONNX = "population.onnx"
@@ -74,16 +67,8 @@ SAME_POINT_M = 3e-3
 """Presses that follow one another and touch within this are taken for presses of one point: of the
 twin's 36 pairs of presses that are, 34 do."""
 
-COMMON_OFFSETS = (0.05, -0.05)
-"""Logarithms of the impedance by which all electrodes are off in the stressed cells."""
-
-TOUCHED_N = 0.5
-"""Rows of a cell have at least this force, as the paper's [N]."""
-
-ROWS_MOST = 60_000
-"""Rows of a cell, evenly over it; more would only cost time."""
-
-DRAWS = 1000
+STOP_SHOTS = 3
+"""Presses that are known of a specimen at most, where the training stops."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,16 +225,17 @@ def train_population(
     """
     where = _device(device)
     data = open_dataset(path)
-    inputs = inputs_of(data.electrodes, data.baseline)
     quantities, targets = targets_of(data)
+    inputs = inputs_of(data.electrodes, data.baseline)
+    rows = PopulationRows(inputs, targets, data.sensor, data.group, points_of(data))
     split = split_population(data, seed=seed)
     begun = time.monotonic()
     with torch.device(where):
         if where == "cuda":
             torch.set_float32_matmul_precision("high")
         net = fit_population(
-            PopulationRows(inputs[split.train], targets[split.train]),
-            [PopulationRows(inputs[rows], targets[rows]) for rows in split.validation],
+            rows.where(split.train),
+            [stop_rows(rows, chosen, seed=seed) for chosen in split.validation],
             quantities,
             config=config,
             seed=seed,
@@ -257,11 +243,8 @@ def train_population(
         )
     trained_s = time.monotonic() - begun
     save_population_net(out / WEIGHTS, net)
-    rivals = _rivals(net, inputs, targets, split)
-    cells = {
-        name: _cell(rows, inputs, targets, data.group, net, rivals)
-        for name, rows in split.cells.items()
-    }
+    rivals = _rivals(net, rows.inputs, targets, split)
+    cells = {name: cell(rows, chosen, net, rivals, seed) for name, chosen in split.cells.items()}
     facts: dict[str, Any] = {
         "data": data.provenance.source,
         "data_sha256": data.content_sha256(),
@@ -287,6 +270,24 @@ def train_population(
     with written_whole(out / REPORT) as part:
         part.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     return net, facts
+
+
+def stop_rows(rows: PopulationRows, chosen: Mask, *, seed: int) -> list[StopRows]:
+    """Rows of each specimen to stop on: with nothing known, and with some of its presses."""
+    drawn = draw_shots(rows, chosen, most=STOP_SHOTS, draws=1, seed=seed)
+    if not drawn:  # too few presses to know some: only nothing is known
+        return [
+            StopRows(rows.inputs[own], rows.targets[own], [rows.calibration(own[:0])])
+            for own in (np.flatnonzero(chosen),)
+        ]
+    return [
+        StopRows(
+            rows.inputs[draw.tested],
+            rows.targets[draw.tested],
+            [rows.calibration(draw.known(shots)) for shots in (0, 1, STOP_SHOTS)],
+        )
+        for draw in drawn
+    ]
 
 
 def _device(wanted: str) -> str:
@@ -332,73 +333,6 @@ def _rivals(
     return {name: estimate(models) for name, models in fitted.items()}
 
 
-def _cell(
-    rows: Mask,
-    inputs: FloatArray,
-    targets: FloatArray,
-    group: npt.NDArray[np.integer],
-    net: PopulationNet,
-    rivals: dict[str, Estimate],
-) -> dict[str, Any]:
-    """Errors of network and rivals in one cell, and of the network with all electrodes off."""
-    touched = rows & (np.linalg.norm(targets[:, :3], axis=1) >= TOUCHED_N)
-    some = np.flatnonzero(touched)
-    some = some[np.unique(np.linspace(0, len(some) - 1, ROWS_MOST).astype(int))]
-    x, truth, press = inputs[some], targets[some], group[some]
-
-    def network(values: FloatArray) -> FloatArray:
-        return predict(net, values)
-
-    names = net.quantities
-    found: dict[str, Any] = {"rows": len(some), "presses": len(np.unique(press))}
-    found["network"] = _figures(names, network(x), truth, press, ends=True)
-    for name, rival in rivals.items():
-        found[name] = _figures(names, rival(x), truth, press)
-    for offset in COMMON_OFFSETS:
-        moved = x.copy()
-        moved[:, :ELECTRODES] += np.float32(offset)
-        found[f"network, all {offset:+g}"] = _figures(names, network(moved), truth, press)
-    still = np.flatnonzero(rows & (np.linalg.norm(targets[:, :3], axis=1) == 0.0))[:ROWS_MOST]
-    if len(still):
-        lengths = np.linalg.norm(network(inputs[still])[:, :3], axis=1)
-        found["untouched_median_n"] = float(np.median(lengths))
-    return found
-
-
-def _figures(
-    names: tuple[str, ...],
-    estimate: npt.NDArray[np.floating],
-    truth: FloatArray,
-    press: npt.NDArray[np.integer],
-    *,
-    ends: bool = False,
-) -> dict[str, Any]:
-    """Medians of the errors, and with ``ends`` their 95 % intervals by press."""
-    errors: dict[str, npt.NDArray[np.float64]] = {}
-    for number, name in enumerate(names):
-        guess, right = (values[:, 3 * number : 3 * number + 3] for values in (estimate, truth))
-        if name == "force":
-            of_force = force_errors(guess, right)
-            hard = np.linalg.norm(right, axis=1) >= FORCE_BINS_N["2_to_8n"][0]
-            errors["force_magnitude_n"] = of_force["magnitude_n"]
-            relative = 100.0 * of_force["magnitude_over_norm"]
-            errors["force_from_2n_percent"] = np.where(hard, relative, np.nan)
-            errors["force_angle_rad"] = of_force["angle_rad"]
-        elif name == "contact_normal":
-            unknown = np.isnan(right).any(axis=1)
-            angle = angles(guess, np.nan_to_num(right))
-            errors["normal_angle_rad"] = np.where(unknown, np.nan, angle)
-        else:
-            errors[f"{name}_mm"] = 1e3 * location_errors(guess, right)["distance_m"]
-    known = {key: values for key, values in errors.items() if np.isfinite(values).any()}
-    figures: dict[str, Any] = {key: float(np.nanmedian(one)) for key, one in known.items()}
-    if ends:
-        figures["ci95"] = {
-            key: interval(drawn_medians([one], press, draws=DRAWS)) for key, one in known.items()
-        }
-    return figures
-
-
 def _export(path: Path, net: PopulationNet, data: FeatureDataset, rows: Mask) -> dict[str, Any]:
     """Write the network as ONNX, if that can be done here; what came of it."""
     try:
@@ -408,7 +342,9 @@ def _export(path: Path, net: PopulationNet, data: FeatureDataset, rows: Mask) ->
         return {"left out": str(error)}
     some = np.flatnonzero(rows)
     some = some[np.unique(np.linspace(0, len(some) - 1, 256).astype(int))]
-    counts = np.hstack([data.electrodes[some], data.baseline[some]]).astype(np.float32)
+    # Codes of presses lie between -1 and 1, mostly.
+    code = np.random.default_rng(0).uniform(-1.0, 1.0, (len(some), 2 * net.config.code))
+    known = np.hstack([data.electrodes[some], data.baseline[some], code]).astype(np.float32)
     graph = CountsGraph(net).eval()
 
     def largest(_: int, right: FloatArray) -> FloatArray:
@@ -417,10 +353,10 @@ def _export(path: Path, net: PopulationNet, data: FeatureDataset, rows: Mask) ->
         return np.asarray(np.repeat(parts.max(axis=(0, 2)), 3))
 
     try:
-        model = onnx_bytes(graph, "counts", torch.zeros(4, INPUTS), ["estimates"])
-        parity = check_parity(graph, model, "counts", ["estimates"], counts, largest)
+        model = onnx_bytes(graph, "known", torch.zeros(4, known.shape[1]), ["estimates"])
+        parity = check_parity(graph, model, "known", ["estimates"], known, largest)
     except (ImportError, BundleError) as error:  # what was trained and measured is there
         return {"left out": str(error)}
     with written_whole(path) as part:
         part.write_bytes(model)
-    return {"parity_max": parity, "milliseconds": 1e3 * frame_s(model, "counts", counts[:1])}
+    return {"parity_max": parity, "milliseconds": 1e3 * frame_s(model, "known", known[:1])}

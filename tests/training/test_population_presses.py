@@ -1,0 +1,184 @@
+"""Presses as input of a population's network: a gain that nothing but a press can tell."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.training.invented_population import SMALL, population
+
+from palpate.errors import DatasetError
+from palpate_training.datasets.features import FeatureDataset, write_dataset
+from palpate_training.evaluation.population import SHOTS, draw_shots, shots_table
+from palpate_training.learning import population_fit
+from palpate_training.learning.networks import predict
+from palpate_training.learning.population_fit import PopulationRows
+from palpate_training.learning.population_net import (
+    WEIGHTS,
+    PopulationNet,
+    inputs_of,
+    load_population_net,
+)
+from palpate_training.learning.press_set import CalibrationPresses
+from palpate_training.tasks.population import REPORT, points_of, targets_of, train_population
+
+UNSEEN = "unseen_specimen_unseen_press"
+
+
+@pytest.fixture(scope="module")
+def data() -> FeatureDataset:
+    return population(told=False, specimens=24, presses=120, each=12)
+
+
+@pytest.fixture(scope="module")
+def rows(data: FeatureDataset) -> PopulationRows:
+    inputs = inputs_of(data.electrodes, data.baseline)
+    _, targets = targets_of(data)
+    return PopulationRows(inputs, targets, data.sensor, data.group, points_of(data))
+
+
+@pytest.fixture(scope="module")
+def folder(data: FeatureDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("trained")
+    write_dataset(out / "features.h5", data)
+    config = replace(SMALL, epochs=40, batch_rows=512)
+    train_population(out / "features.h5", out, config=config, device="cpu")
+    return out
+
+
+@pytest.fixture
+def net(folder: Path) -> PopulationNet:
+    return load_population_net(folder / WEIGHTS)
+
+
+@pytest.fixture
+def presses(rows: PopulationRows) -> CalibrationPresses:
+    (draw, *_) = draw_shots(rows, rows.specimen == 3, most=3, draws=1, seed=0)
+    return rows.calibration(draw.known(3))
+
+
+def mirrored(net: PopulationNet, presses: CalibrationPresses) -> CalibrationPresses:
+    image = net.mirrored_presses(presses.tensor()).numpy()
+    return CalibrationPresses(image[:, :38], image[:, 38:41], presses.press)
+
+
+def test_a_press_tells_what_the_rest_does_not(folder: Path) -> None:
+    shots = json.loads((folder / REPORT).read_text())["cells"][UNSEEN]["shots"]
+    none, one, five = (shots[key]["network"]["force_magnitude_n"] for key in ("0", "1", "5"))
+    assert one < 0.6 * none
+    assert five < 0.5 * none
+    assert one < 1.2 * shots["1"]["one factor"]["force_magnitude_n"]
+    for offset in ("+0.05", "-0.05"):
+        assert shots["1"][f"network, all {offset}"]["force_magnitude_n"] < 0.9 * none
+
+
+def test_the_order_of_rows_and_presses_means_nothing(
+    net: PopulationNet, presses: CalibrationPresses, rows: PopulationRows
+) -> None:
+    order = np.random.default_rng(0).permutation(len(presses.press))
+    shuffled = CalibrationPresses(
+        presses.inputs[order], presses.force[order], 7 - presses.press[order]
+    )
+    first, second = (predict(net, net.told(rows.inputs[:50], one)) for one in (presses, shuffled))
+    np.testing.assert_allclose(first, second, atol=1e-5)
+    none = predict(net, rows.inputs[:50])
+    assert np.abs(first - none).max() > 0.05
+
+
+def test_a_press_is_no_surer_for_being_sampled_fast(
+    net: PopulationNet, presses: CalibrationPresses, rows: PopulationRows
+) -> None:
+    twice = CalibrationPresses(
+        np.repeat(presses.inputs, 2, axis=0),
+        np.repeat(presses.force, 2, axis=0),
+        np.repeat(presses.press, 2),
+    )
+    first, second = (predict(net, net.told(rows.inputs[:50], one)) for one in (presses, twice))
+    np.testing.assert_allclose(first, second, atol=1e-5)
+
+
+def test_mirrored_presses_and_rows_get_the_mirrored_estimate(
+    net: PopulationNet, presses: CalibrationPresses, rows: PopulationRows
+) -> None:
+    plain = rows.inputs[:80]
+    image = plain[:, net.order[:38].numpy()]
+    here = predict(net, net.told(plain, presses))
+    there = predict(net, net.told(image, mirrored(net, presses)))
+    np.testing.assert_allclose(there, here * net.signs.numpy(), atol=1e-5)
+
+
+def test_no_press_is_the_network_that_knows_none(net: PopulationNet, rows: PopulationRows) -> None:
+    nothing = rows.calibration(np.zeros(0, np.int64))
+    told = net.told(rows.inputs[:40], nothing)
+    assert not told[:, 38:].any()
+    np.testing.assert_array_equal(predict(net, told), predict(net, rows.inputs[:40]))
+
+
+def test_presses_of_another_shape_are_refused(presses: CalibrationPresses) -> None:
+    with pytest.raises(DatasetError, match=r"inputs .* has shape .*, 37\), not .*, 38\)"):
+        replace(presses, inputs=presses.inputs[:, 1:])
+    with pytest.raises(DatasetError, match=r"force .* has shape"):
+        replace(presses, force=presses.force[:-1])
+    with pytest.raises(DatasetError, match=r"press .* has shape"):
+        replace(presses, press=presses.press[:, None])
+    broken = presses.force.copy()
+    broken[0, 0] = np.nan
+    with pytest.raises(DatasetError, match="not finite"):
+        replace(presses, force=broken)
+
+
+def test_tested_rows_are_of_no_known_press_and_specimen(rows: PopulationRows) -> None:
+    chosen = rows.press % 2 == 0
+    drawn = draw_shots(rows, chosen, most=10, draws=2, seed=1)
+    assert len(drawn) == 2 * 24
+    assert rows.point is not None
+    for draw in drawn:
+        known = draw.known(10)
+        assert len(draw.presses) == 10
+        assert len(draw.known(0)) == 0
+        assert len(np.unique(rows.press[known])) == 10
+        assert not set(rows.point[known]) & set(rows.point[draw.tested])
+        both = np.concatenate([known, draw.tested])
+        assert len(np.unique(rows.specimen[both])) == 1
+        assert chosen[both].all()
+        assert rows.touched[both].all()
+
+
+def test_training_tells_no_row_its_own_press(
+    rows: PopulationRows, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With one press for each specimen there is nothing else to tell, so nothing is told."""
+    few = rows.where(rows.press == 5)
+    torch.manual_seed(0)
+    net = PopulationNet(("force", "contact_location"), replace(SMALL, stiffness_sd=0.5))
+    net.normalise_from(rows.inputs, rows.targets)
+    episodes = population_fit._Episodes(net, few, np.random.default_rng(0))
+    seen: list[torch.Tensor] = []
+    one_sided = net.one_sided
+
+    def watched(inputs: torch.Tensor) -> torch.Tensor:
+        seen.append(inputs)
+        return one_sided(inputs)
+
+    monkeypatch.setattr(net, "one_sided", watched)
+    numbers = torch.arange(len(episodes.rows)).float()[:, None]
+    episodes(numbers)
+    assert not seen[-1][..., 38:].any()
+    monkeypatch.undo()
+    several = population_fit._Episodes(net, rows, np.random.default_rng(0))
+    monkeypatch.setattr(net, "one_sided", watched)
+    several(torch.arange(32).float()[:, None])
+    assert seen[-1][..., 38:].any()
+
+
+def test_a_set_with_few_presses_has_a_table_as_far_as_they_go(
+    rows: PopulationRows, net: PopulationNet
+) -> None:
+    few = np.isin(rows.press, np.unique(rows.press)[:9])
+    table = shots_table(rows, few, net, seed=0)
+    assert {int(key) for key in table if key.isdigit()} == {0, 1, 5} < set(SHOTS)
+    assert shots_table(rows, rows.press == 5, net, seed=0) == {}
