@@ -224,11 +224,8 @@ def train_transfer(
     seed: Annotated[int, typer.Option(help="Of the draws.")] = 0,
     pretrained: Annotated[
         Path | None,
-        typer.Option(help="Folder of `palpate train population`; its network helps as --way says."),
+        typer.Option(help="Folder of `palpate train population`, whose network helps."),
     ] = None,
-    way: Annotated[
-        str, typer.Option(help="How the network is used: input, rest-of-it, hidden or alone.")
-    ] = "input",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
     """Force on a finger that training has not met, and after a few presses of it.
@@ -238,13 +235,17 @@ def train_transfer(
     from palpate_training.evaluation.transfer import (
         FIGURES,
         fingers_of,
-        pretrained_from,
         run_transfer,
         steps_of,
         worst_of,
     )
 
-    helper = None if pretrained is None else pretrained_from(pretrained, way)
+    helper = None
+    if pretrained is not None:
+        from palpate_training.learning.population_net import WEIGHTS, load_population_net
+        from palpate_training.systems.transfer import Pretrained
+
+        helper = Pretrained(load_population_net(pretrained / WEIGHTS))
     known = [finger for path in train for finger in fingers_of(open_dataset(path))]
     tested = fingers_of(open_dataset(test))
     with _progress(Console(stderr=True)) as progress:
@@ -343,11 +344,11 @@ def train_population_command(
         float,
         typer.Option(
             min=0.0,
-            help="Log-normal spread of all forces of a specimen whose presses are known, in training.",
+            help="The same of a specimen's forces, which its presses tell.",
         ),
     ] = 0.3,
 ) -> None:
-    """One network for a population, told a specimen by its rest and by up to ten presses of it.
+    """One network for a population, told a specimen by its rest and by presses of it.
 
     It is tested on specimens and presses that it has not met.
 
@@ -372,7 +373,7 @@ def train_population_command(
         for key in facts["ratio_unseen_to_seen_specimen"]:
             table.add_row(key, *(f"{cell[rival].get(key, float('nan')):.3f}" for rival in rivals))
         console.print(table)
-        shots = {key: one["network"] for key, one in cell["shots"].items() if key.isdigit()}
+        shots = {key: one["network"] for key, one in cell.get("shots", {}).items() if key.isdigit()}
         if shots:
             table = Table("", *(f"{key} presses" for key in shots), title="the same, presses known")
             for key in shots["0"]:

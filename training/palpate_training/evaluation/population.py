@@ -97,13 +97,12 @@ def draw_shots(
 
 
 def cell(
-    rows: PopulationRows, chosen: Mask, net: PopulationNet, rivals: dict[str, Estimate], seed: int
+    rows: PopulationRows, chosen: Mask, net: PopulationNet, rivals: dict[str, Estimate]
 ) -> dict[str, Any]:
     """Errors of network and rivals in one cell, and of the network with all electrodes off.
 
     Returns:
-        By name of the rival, medians; in ``shots`` those of the network and of its estimate times
-        one factor by number of presses, on other rows than the rest.
+        By name of the rival, medians.
     """
     some = np.flatnonzero(chosen & rows.touched)
     some = some[np.unique(np.linspace(0, len(some) - 1, ROWS_MOST).astype(int))]
@@ -121,14 +120,18 @@ def cell(
     if still.any():
         lengths = np.linalg.norm(predict(net, rows.inputs[still][:ROWS_MOST])[:, :3], axis=1)
         found["untouched_median_n"] = float(np.median(lengths))
-    found["shots"] = shots_table(rows, chosen, net, seed=seed)
     return found
 
 
 def shots_table(
     rows: PopulationRows, chosen: Mask, net: PopulationNet, *, seed: int
 ) -> dict[str, Any]:
-    """Errors by number of known presses; empty where no specimen has presses enough for one."""
+    """Errors by number of known presses of the network, and of its estimate times one factor.
+
+    Returns:
+        By number of presses the medians by name of the rival, all on the same rows; empty where no
+        specimen has presses enough for one.
+    """
     for most in sorted(SHOTS, reverse=True):
         drawn = draw_shots(rows, chosen, most=most, draws=SHOT_DRAWS, seed=seed) if most else []
         if drawn:

@@ -13,20 +13,17 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from palpate.errors import ConfigError, DatasetError
+from palpate.errors import DatasetError
 from palpate_training.datasets.container import add_array
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.learning.baselines import ridge
 from palpate_training.learning.metrics import force_errors
-from palpate_training.learning.population_net import WEIGHTS, load_population_net
 from palpate_training.systems.transfer import (
-    WAYS,
     FingerRecording,
     ForceTransfer,
     LabelledPresses,
@@ -103,19 +100,6 @@ def _finger(data: FeatureDataset, sensor: int) -> Finger:
     return Finger(data.sensor_names[sensor], recording, data.tared_counts[rows])
 
 
-def pretrained_from(folder: Path, way: str) -> Pretrained:
-    """The network that ``palpate train population`` left in a folder, to be used in a way.
-
-    Raises:
-        ConfigError: There is no such way.
-        DatasetError: The folder holds no network.
-    """
-    for known in WAYS:
-        if way == known:
-            return Pretrained(load_population_net(folder / WEIGHTS), known)
-    raise ConfigError(f"no way {way!r} to use a network", remedy=f"choose from {', '.join(WAYS)}")
-
-
 def run_transfer(
     train: Sequence[Finger],
     test: Finger,
@@ -162,17 +146,22 @@ def run_transfer(
         )
     sources = [finger.recording for finger in train]
     width = _width_on_others(train, pretrained, on_step)
-    model = ForceTransfer(sources, pretrained)
-    on_step()
-    zero = model.estimate(test.recording, unlabelled=unlabelled)
-    on_step()
     rng = np.random.default_rng(seed)
+    # As much is told of the sources as of the tested finger.
+    told = [_told(source, shots, seed) for source in sources] if pretrained and shots else ()
+    model = ForceTransfer(sources, pretrained, told)
+    on_step()
+    plain = model.estimate(test.recording, unlabelled=unlabelled)
+    on_step()
     found: dict[str, list[dict[str, float]]] = {"": [], "constant": [], "ridge": []}
     for _ in range(draws if shots else 1):
         labelled, tested = _draw(pieces, shots, test.recording, rng)
-        force, own_width = zero, width
-        if shots:
-            corrected = model.correct(test.recording, zero, labelled)
+        own_width = width
+        if not shots:
+            force = model.helped(test.recording, plain)
+        else:
+            helped = model.helped(test.recording, plain, labelled)
+            corrected = model.correct(test.recording, helped, labelled)
             force = corrected.force
             known = test.recording.force[labelled.rows]
             share = shots / (shots + PRESSES_OF_OTHERS)
@@ -202,7 +191,7 @@ def run_transfer(
         "unlabelled": unlabelled,
         "draws": draws if shots else 1,
         "seed": seed,
-        **({} if pretrained is None else {"pretrained": pretrained.way}),
+        "pretrained": pretrained is not None,
         "rows": len(test.recording.force),
     }
 
@@ -250,6 +239,11 @@ def _draw(
     return LabelledPresses(known, press), np.flatnonzero(tested)
 
 
+def _told(source: FingerRecording, shots: int, seed: int) -> LabelledPresses:
+    pieces = _presses(source)
+    return _draw(pieces, min(shots, len(pieces)), source, np.random.default_rng(seed))[0]
+
+
 def _width(estimate: Floats, truth: Floats) -> float:
     """Half width of the intervals over ``FLOOR_N`` plus the magnitude, from known forces."""
     errors = force_errors(estimate, truth)["magnitude_n"]
@@ -276,7 +270,7 @@ def _width_on_others(
     estimates, truths = [], []
     for sources, tested in held_out:
         model = ForceTransfer(sources, pretrained)
-        estimates.append(model.estimate(tested, unlabelled=False))
+        estimates.append(model.helped(tested, model.estimate(tested, unlabelled=False)))
         truths.append(tested.force)
         on_step()
     return _width(np.vstack(estimates), np.vstack(truths))

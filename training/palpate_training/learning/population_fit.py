@@ -191,10 +191,12 @@ class _Episodes(nn.Module):
         known, used = self._presses(specimen)  # (G, K, R), (G, K)
         one = torch.ones(len(block), 1, 1, device=numbers.device)
         electrodes = one.expand(-1, 1, ELECTRODES)
-        gain = torch.exp(config.gain_sd * torch.randn_like(electrodes))
+        gain = torch.exp(config.gain_sd * (torch.randn_like(electrodes) + torch.randn_like(one)))
         rest_off = config.rest_sd * torch.randn_like(electrodes)
         mirrored = torch.rand_like(one) < 0.5
-        stiffness = torch.exp(config.stiffness_sd * torch.randn_like(one))
+        # Forces of a specimen that was turned, and is stiffer.
+        turn = _turns(config.turn_sd * torch.randn(len(block), 3, device=numbers.device))
+        turn = turn * torch.exp(config.stiffness_sd * torch.randn_like(one))  # (G, 3, 3)
 
         def seen(inputs: Tensor, offsets: Tensor) -> Tensor:
             noisy = _noisy(inputs, offsets, gain, rest_off, config)
@@ -206,7 +208,7 @@ class _Episodes(nn.Module):
         of_press = of_press.expand(*known.shape, ELECTRODES).flatten(1, 2)
         presses = seen(self.inputs[known].flatten(1, 2), of_press)
         signs = torch.where(mirrored, net.signs[:3], 1.0)
-        force = self.force[known].flatten(1, 2) * stiffness * signs
+        force = (self.force[known].flatten(1, 2) @ turn.mT) * signs
         share = used[:, :, None].expand(known.shape).flatten(1)[..., None] / PRESS_ROWS
         code = net.code_of(torch.cat([presses, force, share], dim=-1))  # (G, C)
         own = (self.point[rows][..., None] == self.point[known[..., 0]][:, None]) & used[:, None]
@@ -215,8 +217,8 @@ class _Episodes(nn.Module):
         inputs = torch.cat([inputs, torch.where(told, code[:, None], 0.0)], dim=-1)
         estimate = net.one_sided(inputs)
         estimate = torch.where(mirrored, estimate * net.signs, estimate)
-        # A stiffer skin: what is estimated is over the factor what the electrodes stood for.
-        plain = estimate[..., :3] / torch.where(told, stiffness, 1.0)
+        # What is estimated is such a force, what it is compared with is not.
+        plain = torch.where(told, estimate[..., :3] @ torch.linalg.inv(turn).mT, estimate[..., :3])
         return torch.cat([plain, estimate[..., 3:]], dim=-1).flatten(1)
 
     def _presses(self, specimen: Tensor) -> tuple[Tensor, Tensor]:
@@ -236,6 +238,14 @@ def _offsets(shape: Sequence[int], config: PopulationConfig, device: torch.devic
     """Offsets of all electrodes and of each, drawn for each of a shape, ``(*shape, 19)``."""
     each = torch.randn(*shape, ELECTRODES, device=device)
     return config.offset_sd * each + config.common_sd * torch.randn(*shape, 1, device=device)
+
+
+def _turns(vectors: Tensor) -> Tensor:
+    """Rotations by vectors ``(G, 3)`` [rad], ``(G, 3, 3)``."""
+    x, y, z = vectors.unbind(dim=-1)
+    none = torch.zeros_like(x)
+    rows = [none, -z, y, z, none, -x, -y, x, none]
+    return torch.matrix_exp(torch.stack(rows, dim=-1).reshape(-1, 3, 3))
 
 
 def _noisy(

@@ -68,11 +68,14 @@ class PopulationConfig(FitConfig):
             of them changes nothing.
         common_sd: Of a training row, standard deviation of the offset of all electrodes.
         offset_sd: The same of each electrode by itself: tares that are off, electrodes that drift.
-        gain_sd: Of each electrode, standard deviation of the logarithm of its gain.
+        gain_sd: Standard deviation of the logarithm of the gain that all electrodes share, and of
+            each's own.
         rest_sd: The same of what each electrode at rest is off by; keeps specimens of the training
             from being known by heart.
         stiffness_sd: Standard deviation of the logarithm of the factor of all forces of a specimen
             whose presses are known: a skin as thick but stiffer, which only a press can tell.
+        turn_sd: Of such a specimen, standard deviation of the rotation of its forces about each
+            axis [rad]: a finger that sits otherwise than it is believed to.
         force_power: Errors of forces count over ``FORCE_FLOOR_N`` plus the magnitude to this power.
     """
 
@@ -92,6 +95,7 @@ class PopulationConfig(FitConfig):
     gain_sd: float = 0.03
     rest_sd: float = 0.02
     stiffness_sd: float = 0.3
+    turn_sd: float = 0.0
     force_power: float = 0.5
 
 

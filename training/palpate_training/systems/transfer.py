@@ -11,8 +11,8 @@ From a finger's electrodes *without* forces comes more about the direction: a re
 spread, electrode by electrode, take the place of the other fingers'. From a few *labelled* presses
 comes a correction that reaches as far as what was pressed, by the common mode, too.
 
-A network of a simulated population may be given, too (``Pretrained``); whether it helps is in
-training/LOG.md.
+A network of a simulated population may be given, too, and is told the labelled presses: it has a
+share in the magnitude (``Pretrained``). Whether that helps is in training/LOG.md.
 
 All constants were chosen on the two fingers of the LASA force calibration, in both directions, the
 worse counting, and then frozen (training/LOG.md).
@@ -23,7 +23,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -33,12 +32,8 @@ from scipy.signal import lfilter
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
 from palpate_training.learning.electrode_nets import MIRROR_AXES
 from palpate_training.learning.networks import predict
-from palpate_training.learning.population_net import (
-    PopulationNet,
-    hidden_axes,
-    hidden_values,
-    inputs_of,
-)
+from palpate_training.learning.population_net import PopulationNet, inputs_of
+from palpate_training.learning.press_set import CalibrationPresses
 from palpate_training.systems.samples import impedance_ohm
 
 Floats = npt.NDArray[np.float64]
@@ -118,6 +113,9 @@ PRESS_VARIANCE_N2 = 0.02
 
 ROW_VARIANCE_N2 = 0.01
 
+HELPED = 0.25
+"""Share of a population's network in the magnitude, where there is one."""
+
 
 @dataclass(frozen=True, slots=True)
 class FingerRecording:
@@ -129,9 +127,6 @@ class FingerRecording:
         segment: Number of the uninterrupted piece that each row belongs to, shape (N,).
         period_s: Time between two rows [s].
         force: [N], sensor frame, shape (N, 3).
-        prior: Force that processes learn what is left of [N], shape (N, 3).
-        extra: What they read besides, shape (N, E).
-        extra_signs: What a mirror image makes of that, 1 or -1, shape (E,).
     """
 
     electrodes: Counts
@@ -139,16 +134,11 @@ class FingerRecording:
     segment: npt.NDArray[np.integer]
     period_s: float
     force: Floats
-    prior: Floats | None = None
-    extra: Floats | None = None
-    extra_signs: Floats = field(default_factory=lambda: np.ones(0))
 
     def parts(self, inputs: Inputs) -> list[Floats]:
-        """Present values, then their differences from moving means, each of shape (N, 19 + E)."""
+        """Present values, then their differences from moving means, each of shape (N, 19)."""
         values = np.log(impedance_ohm(self.electrodes) / impedance_ohm(self.baseline))
         values -= (1.0 - inputs.common) * values.mean(axis=1, keepdims=True)
-        if self.extra is not None:
-            values = np.hstack([values, self.extra])
         means = (self._moving_mean(values, context_s) for context_s in inputs.contexts_s)
         return [values, *(values - mean for mean in means)]
 
@@ -159,8 +149,6 @@ class FingerRecording:
             electrodes=self.electrodes[:, ELECTRODE_MIRROR],
             baseline=self.baseline[:, ELECTRODE_MIRROR],
             force=self.force * MIRROR_AXES,
-            prior=None if self.prior is None else self.prior * MIRROR_AXES,
-            extra=None if self.extra is None else self.extra * self.extra_signs,
         )
 
     def _moving_mean(self, values: Floats, context_s: float) -> Floats:
@@ -176,45 +164,62 @@ class FingerRecording:
         return mean
 
 
-Way = Literal["input", "rest-of-it", "hidden", "alone"]
-"""Of using a network: its force as input of the processes; processes of what its scaled force
-leaves; its hidden values as input; or its scaled force alone."""
+@dataclass(frozen=True, slots=True)
+class LabelledPresses:
+    """Rows of the finger with a known force.
 
-WAYS: tuple[Way, ...] = get_args(Way)
+    Attributes:
+        rows: Their numbers, shape (M,).
+        press: Press of each, shape (M,).
+    """
 
-HIDDEN = 4
-"""Principal hidden values that processes read, even ones and as many odd ones."""
+    rows: npt.NDArray[np.integer]
+    press: npt.NDArray[np.integer]
 
 
 @dataclass(frozen=True, slots=True)
 class Pretrained:
-    """A network, how it is used, and what was fitted to the sources: its scale, its axes."""
+    """A network of a population, and the linear map that takes its forces to those of real fingers.
+
+    Twin and real fingers differ alike for all fingers, by more than specimens of the twin do.
+    """
 
     net: PopulationNet
-    way: Way = "input"
-    scale: float = 1.0
-    axes: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    to_real: Floats = field(default_factory=lambda: np.eye(3))
 
-    def fitted(self, sources: Sequence[FingerRecording]) -> Pretrained:
-        """The same, scaled on recordings with their forces."""
-        inputs = [inputs_of(source.electrodes, source.baseline) for source in sources]
-        guess = np.vstack([predict(self.net, rows)[:, :3] for rows in inputs]).astype(np.float64)
+    def fitted(
+        self, sources: Sequence[FingerRecording], labelled: Sequence[LabelledPresses | None]
+    ) -> Pretrained:
+        """The same with the map that fits recordings with their forces, and their mirror images.
+
+        Args:
+            sources: The recordings.
+            labelled: What the network is told of each: as much as of the finger that is tested.
+        """
+        told = zip(sources, labelled, strict=True)
+        guess = np.vstack([self.force(source, presses) for source, presses in told])
         force = np.vstack([source.force for source in sources])
-        scale = float((guess * force).sum() / max((guess * guess).sum(), 1e-12))
-        axes = hidden_axes(self.net, np.vstack(inputs), HIDDEN)
-        return replace(self, scale=scale, axes=axes)
+        both = (np.vstack([one, one * MIRROR_AXES]) for one in (guess, force))
+        fit = np.linalg.lstsq(*both, rcond=None)[0]
+        return replace(self, to_real=self.to_real @ fit)
 
-    def told(self, recording: FingerRecording) -> FingerRecording:
-        """The recording with what the network says of it."""
-        inputs = inputs_of(recording.electrodes, recording.baseline)
-        if self.way == "hidden":
-            hidden = hidden_values(self.net, inputs) @ self.axes
-            signs = np.repeat([1.0, -1.0], HIDDEN)
-            return replace(recording, extra=hidden, extra_signs=signs)
-        force = self.scale * predict(self.net, inputs)[:, :3].astype(np.float64)
-        if self.way == "input":
-            return replace(recording, extra=force, extra_signs=MIRROR_AXES.astype(np.float64))
-        return replace(recording, prior=force)
+    def force(
+        self,
+        recording: FingerRecording,
+        labelled: LabelledPresses | None,
+        rows: npt.NDArray[np.integer] | slice = slice(None),
+    ) -> Floats:
+        """Forces of some rows of a finger [N], after presses of it."""
+        inputs = inputs_of(recording.electrodes[rows], recording.baseline[rows])
+        if labelled is not None:
+            own = labelled.rows
+            presses = CalibrationPresses(
+                inputs_of(recording.electrodes[own], recording.baseline[own]),
+                recording.force[own],
+                labelled.press,
+            )
+            inputs = self.net.told(inputs, presses)
+        return np.asarray(predict(self.net, inputs)[:, :3].astype(np.float64) @ self.to_real)
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +268,7 @@ class _Process:
             some = np.unique(some)
             for one in (source, source.mirrored()):
                 rows.append(self._scale_of(one).apply(one, inputs, some))
-                targets.append(one.force[some] - (0.0 if one.prior is None else one.prior[some]))
+                targets.append(one.force[some])
         self._rows = np.vstack(rows)
         force = np.vstack(targets)
         self._unit = force.std()
@@ -280,21 +285,7 @@ class _Process:
         rows = self._scale_of(recording).apply(recording, self._inputs, everything)
         parts = np.array_split(rows, max(1, len(rows) // 4000))
         estimate = [self._kernel(part, self._rows) @ self._weight for part in parts]
-        learned = self._unit * np.vstack(estimate)
-        return np.asarray(learned if recording.prior is None else recording.prior + learned)
-
-
-@dataclass(frozen=True, slots=True)
-class LabelledPresses:
-    """Rows of the finger with a known force.
-
-    Attributes:
-        rows: Their numbers, shape (M,).
-        press: Press of each, shape (M,).
-    """
-
-    rows: npt.NDArray[np.integer]
-    press: npt.NDArray[np.integer]
+        return np.asarray(self._unit * np.vstack(estimate))
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,12 +305,20 @@ class ForceTransfer:
     """Estimates forces on fingers that are not among those it was fitted to."""
 
     def __init__(
-        self, sources: Sequence[FingerRecording], pretrained: Pretrained | None = None
+        self,
+        sources: Sequence[FingerRecording],
+        pretrained: Pretrained | None = None,
+        told: Sequence[LabelledPresses | None] = (),
     ) -> None:
-        """Fit to recordings of other fingers, with their forces; with a pre-trained network."""
-        self._prior = None if pretrained is None else pretrained.fitted(sources)
-        if self._prior is not None:
-            sources = [self._prior.told(source) for source in sources]
+        """Fit to recordings of other fingers, with their forces.
+
+        Args:
+            sources: The recordings.
+            pretrained: A network that helps.
+            told: What it is told of each; empty = of none anything.
+        """
+        told = told or [None for _ in sources]
+        self._helper = None if pretrained is None else pretrained.fitted(sources, told)
         self._sources = sources
         self._scale = _Scale.shared(sources, CORRECTION_INPUTS)
         # Some estimate both magnitude and direction.
@@ -340,11 +339,6 @@ class ForceTransfer:
             unlabelled: Whether mean and spread of all its electrodes may be used, later rows
                 included; else a row's estimate follows from the tare and the rows before it.
         """
-        if self._prior is not None:
-            recording = self._prior.told(recording)
-            if self._prior.way == "alone":
-                assert recording.prior is not None
-                return recording.prior
         forces = {each: process(recording) for each, process in self._processes.items()}
         direction = _mean_direction([forces[each] for each in DIRECTION])
         if unlabelled:
@@ -353,6 +347,22 @@ class ForceTransfer:
         lengths = [np.linalg.norm(forces[each], axis=1) for each in MAGNITUDE]
         return np.asarray(np.mean(lengths, axis=0)[:, None] * direction)
 
+    def helped(
+        self, recording: FingerRecording, estimate: Floats, labelled: LabelledPresses | None = None
+    ) -> Floats:
+        """Estimates of all rows with the network's share in their magnitude, if there is one.
+
+        Args:
+            recording: With the forces of the labelled rows; no others are looked at.
+            estimate: Of all its rows [N], shape (N, 3).
+            labelled: What the network is told.
+        """
+        if self._helper is None:
+            return estimate
+        helped = np.linalg.norm(self._helper.force(recording, labelled), axis=1)
+        length = np.linalg.norm(estimate, axis=1)
+        return np.asarray(_unit(estimate) * ((1.0 - HELPED) * length + HELPED * helped)[:, None])
+
     def correct(
         self, recording: FingerRecording, estimate: Floats, labelled: LabelledPresses
     ) -> CorrectedForces:
@@ -360,12 +370,10 @@ class ForceTransfer:
 
         Args:
             recording: With the forces of the labelled rows; no others are looked at.
-            estimate: Of all its rows [N], shape (N, 3).
+            estimate: Of all its rows [N], as ``helped`` has them, shape (N, 3).
             labelled: Which rows.
         """
         everything = np.arange(len(estimate))
-        if self._prior is not None:
-            recording = self._prior.told(recording)
         rows = self._scale.apply(recording, CORRECTION_INPUTS, everything)
         known = rows[labelled.rows]
         error = recording.force[labelled.rows] - estimate[labelled.rows]
@@ -386,9 +394,29 @@ class ForceTransfer:
         held_out = np.empty_like(error)
         for press in np.unique(labelled.press):
             own = labelled.press == press
+            without = self._without(recording, estimate[labelled.rows], labelled, own)
+            weight = inverse @ (recording.force[labelled.rows] - without)
             left = np.linalg.solve(inverse[np.ix_(own, own)], weight[own])
             held_out[own] = recording.force[labelled.rows[own]] - left
         return CorrectedForces(force, held_out)
+
+    def _without(
+        self,
+        recording: FingerRecording,
+        estimate: Floats,
+        labelled: LabelledPresses,
+        own: npt.NDArray[np.bool_],
+    ) -> Floats:
+        """Estimates of the labelled rows (M, 3), had a network not been told some of them."""
+        if self._helper is None:
+            return estimate
+        others = LabelledPresses(labelled.rows[~own], labelled.press[~own])
+        told, less = (
+            np.linalg.norm(self._helper.force(recording, some, labelled.rows), axis=1)
+            for some in (labelled, others)
+        )
+        length = np.linalg.norm(estimate, axis=1) + HELPED * (less - told)
+        return np.asarray(_unit(estimate) * length[:, None])
 
 
 def _mean_direction(forces: Sequence[Floats]) -> Floats:

@@ -32,7 +32,7 @@ from palpate_training.datasets.features import (
     FeatureDataset,
     open_dataset,
 )
-from palpate_training.evaluation.population import Estimate, cell, draw_shots
+from palpate_training.evaluation.population import Estimate, cell, draw_shots, shots_table
 from palpate_training.learning import baselines
 from palpate_training.learning.population_fit import (
     TOUCHED_N,
@@ -244,7 +244,9 @@ def train_population(
     trained_s = time.monotonic() - begun
     save_population_net(out / WEIGHTS, net)
     rivals = _rivals(net, rows.inputs, targets, split)
-    cells = {name: cell(rows, chosen, net, rivals, seed) for name, chosen in split.cells.items()}
+    cells = {name: cell(rows, chosen, net, rivals) for name, chosen in split.cells.items()}
+    for name in ("unseen_specimen_seen_press", "unseen_specimen_unseen_press"):
+        cells[name]["shots"] = shots_table(rows, split.cells[name], net, seed=seed)
     facts: dict[str, Any] = {
         "data": data.provenance.source,
         "data_sha256": data.content_sha256(),
