@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from tests.training.invented_population import ROWS, SMALL, population
 
 from palpate.errors import DatasetError
 from palpate_training.datasets.features import FeatureDataset, write_dataset
-from palpate_training.evaluation.population import SHOTS, draw_shots, shots_table
 from palpate_training.evaluation.transfer import fingers_of
 from palpate_training.learning import population_fit
 from palpate_training.learning.networks import predict
@@ -27,6 +27,7 @@ from palpate_training.learning.population_net import (
 from palpate_training.learning.press_set import CalibrationPresses
 from palpate_training.systems.transfer import ForceTransfer, LabelledPresses, Pretrained
 from palpate_training.tasks.population import REPORT, points_of, targets_of, train_population
+from palpate_training.tasks.population_errors import SHOTS, draw_shots, shots_table
 
 UNSEEN = "unseen_specimen_unseen_press"
 
@@ -210,3 +211,49 @@ def test_a_real_finger_is_told_by_its_presses(folder: Path, data: FeatureDataset
     changed = model.correct(other, model.helped(other, plain, labelled), labelled).held_out
     np.testing.assert_allclose(changed[own], kept[own], atol=1e-6)
     assert np.abs(changed[~own] - kept[~own]).max() > 1e-3
+
+
+def test_turns_are_rotations() -> None:
+    vectors = 0.5 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    turns = population_fit._turns(vectors)
+    expected = Rotation.from_rotvec(vectors.numpy()).as_matrix()
+    np.testing.assert_allclose(turns.numpy(), expected, atol=1e-6)
+    np.testing.assert_allclose(population_fit._turns(torch.zeros(1, 3))[0].numpy(), np.eye(3))
+
+
+def test_an_estimate_of_a_stiffer_turned_specimen_is_taken_back(
+    rows: PopulationRows, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A network that told the stiffness and the turn right would have no error."""
+    config = replace(
+        SMALL, stiffness_sd=0.5, turn_sd=0.3, common_sd=0.0, offset_sd=0.0, rest_sd=0.0
+    )
+    net = PopulationNet(("force",), config)
+    episodes = population_fit._Episodes(net, rows, np.random.default_rng(0))
+    truth = episodes.force[episodes.rows]  # (N, 32, 3)
+    drawn: dict[str, torch.Tensor] = {}
+
+    def code_of(presses: torch.Tensor) -> torch.Tensor:
+        drawn["force"] = presses[..., 38:41]
+        return torch.ones(len(presses), config.code)
+
+    def taken(specimen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        few = episodes.rows[numbers[:, 0].long(), :30].reshape(-1, 10, 3)
+        return few, torch.ones(len(few), 10, dtype=torch.bool)
+
+    def perfect(inputs: torch.Tensor) -> torch.Tensor:
+        plain = truth[numbers[:, 0].long()]
+        given, seen = plain[:, :30], drawn["force"]
+        # What the presses were turned into tells the map, a mirror image and all.
+        fit = torch.linalg.lstsq(given, seen).solution
+        return plain @ fit
+
+    numbers = torch.arange(40).float()[:, None]
+    monkeypatch.setattr(net, "code_of", code_of)
+    monkeypatch.setattr(net, "one_sided", perfect)
+    monkeypatch.setattr(episodes, "_presses", taken)
+    # Presses are at other points than the last two rows of a block, which so are told them.
+    episodes.point = torch.arange(len(episodes.point)) + 10**6
+    episodes.point[episodes.rows[:40, :30].flatten()] *= -1
+    back = episodes(numbers).reshape(40, 32, 3)
+    np.testing.assert_allclose(back[:, 30:].numpy(), truth[:40, 30:].numpy(), atol=2e-3)

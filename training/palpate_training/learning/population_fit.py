@@ -18,11 +18,12 @@ import torch
 from torch import Tensor, nn
 
 from palpate.messages import COUNTS_MAX
+from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning.electrode_nets import NOISE_COUNTS
 from palpate_training.learning.fit import OnEpoch, fit
 from palpate_training.learning.networks import predict
 from palpate_training.learning.population_net import PopulationConfig, PopulationNet
-from palpate_training.learning.press_set import ELECTRODES, INPUTS, CalibrationPresses
+from palpate_training.learning.press_set import INPUTS, CalibrationPresses
 
 FloatArray = npt.NDArray[np.float32]
 Numbers = npt.NDArray[np.integer]
@@ -43,6 +44,7 @@ BLOCK_ROWS = 32
 _KEPT_ROWS = 16
 """Rows of a press that are drawn from."""
 
+_SMALLEST_RAD = 1e-9
 _SMOOTH = 1e-4  # of a normalised distance's square, so that its root has a slope at zero
 
 
@@ -196,7 +198,7 @@ class _Episodes(nn.Module):
         mirrored = torch.rand_like(one) < 0.5
         # Forces of a specimen that was turned, and is stiffer.
         turn = _turns(config.turn_sd * torch.randn(len(block), 3, device=numbers.device))
-        turn = turn * torch.exp(config.stiffness_sd * torch.randn_like(one))  # (G, 3, 3)
+        stiffness = torch.exp(config.stiffness_sd * torch.randn_like(one))
 
         def seen(inputs: Tensor, offsets: Tensor) -> Tensor:
             noisy = _noisy(inputs, offsets, gain, rest_off, config)
@@ -208,7 +210,7 @@ class _Episodes(nn.Module):
         of_press = of_press.expand(*known.shape, ELECTRODES).flatten(1, 2)
         presses = seen(self.inputs[known].flatten(1, 2), of_press)
         signs = torch.where(mirrored, net.signs[:3], 1.0)
-        force = (self.force[known].flatten(1, 2) @ turn.mT) * signs
+        force = stiffness * (self.force[known].flatten(1, 2) @ turn.mT) * signs
         share = used[:, :, None].expand(known.shape).flatten(1)[..., None] / PRESS_ROWS
         code = net.code_of(torch.cat([presses, force, share], dim=-1))  # (G, C)
         own = (self.point[rows][..., None] == self.point[known[..., 0]][:, None]) & used[:, None]
@@ -218,7 +220,7 @@ class _Episodes(nn.Module):
         estimate = net.one_sided(inputs)
         estimate = torch.where(mirrored, estimate * net.signs, estimate)
         # What is estimated is such a force, what it is compared with is not.
-        plain = torch.where(told, estimate[..., :3] @ torch.linalg.inv(turn).mT, estimate[..., :3])
+        plain = torch.where(told, estimate[..., :3] @ turn / stiffness, estimate[..., :3])
         return torch.cat([plain, estimate[..., 3:]], dim=-1).flatten(1)
 
     def _presses(self, specimen: Tensor) -> tuple[Tensor, Tensor]:
@@ -241,11 +243,17 @@ def _offsets(shape: Sequence[int], config: PopulationConfig, device: torch.devic
 
 
 def _turns(vectors: Tensor) -> Tensor:
-    """Rotations by vectors ``(G, 3)`` [rad], ``(G, 3, 3)``."""
+    """Rotations by vectors ``(G, 3)`` [rad], ``(G, 3, 3)``, by Rodrigues' formula.
+
+    A matrix exponential reads back from a GPU, which a recorded step must not.
+    """
+    angle = torch.linalg.vector_norm(vectors, dim=-1)[:, None, None] + _SMALLEST_RAD
     x, y, z = vectors.unbind(dim=-1)
     none = torch.zeros_like(x)
-    rows = [none, -z, y, z, none, -x, -y, x, none]
-    return torch.matrix_exp(torch.stack(rows, dim=-1).reshape(-1, 3, 3))
+    rows = torch.stack([none, -z, y, z, none, -x, -y, x, none], dim=-1)
+    cross = rows.reshape(-1, 3, 3) / angle
+    eye = torch.eye(3, device=vectors.device)
+    return eye + torch.sin(angle) * cross + (1.0 - torch.cos(angle)) * (cross @ cross)
 
 
 def _noisy(

@@ -199,8 +199,8 @@ class Pretrained:
         told = zip(sources, labelled, strict=True)
         guess = np.vstack([self.force(source, presses) for source, presses in told])
         force = np.vstack([source.force for source in sources])
-        both = (np.vstack([one, one * MIRROR_AXES]) for one in (guess, force))
-        fit = np.linalg.lstsq(*both, rcond=None)[0]
+        guesses, forces = (np.vstack([one, one * MIRROR_AXES]) for one in (guess, force))
+        fit = np.linalg.lstsq(guesses, forces, rcond=None)[0]
         return replace(self, to_real=self.to_real @ fit)
 
     def force(

@@ -32,7 +32,6 @@ from palpate_training.datasets.features import (
     FeatureDataset,
     open_dataset,
 )
-from palpate_training.evaluation.population import Estimate, cell, draw_shots, shots_table
 from palpate_training.learning import baselines
 from palpate_training.learning.population_fit import (
     TOUCHED_N,
@@ -48,6 +47,7 @@ from palpate_training.learning.population_net import (
     inputs_of,
     save_population_net,
 )
+from palpate_training.tasks.population_errors import Estimate, cell, draw_shots, shots_table
 
 FloatArray = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
