@@ -245,8 +245,8 @@ def test_an_estimate_of_a_stiffer_turned_specimen_is_taken_back(
         plain = truth[numbers[:, 0].long()]
         given, seen = plain[:, :30], drawn["force"]
         # What the presses were turned into tells the map, a mirror image and all.
-        fit = torch.linalg.lstsq(given, seen).solution
-        return plain @ fit
+        estimate: torch.Tensor = plain @ torch.linalg.lstsq(given, seen).solution
+        return estimate
 
     numbers = torch.arange(40).float()[:, None]
     monkeypatch.setattr(net, "code_of", code_of)

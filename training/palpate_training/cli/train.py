@@ -346,7 +346,7 @@ def train_population_command(
             min=0.0,
             help="The same of a specimen's forces, which its presses tell.",
         ),
-    ] = 0.3,
+    ] = 0.0,
 ) -> None:
     """One network for a population, told a specimen by its rest and by presses of it.
 

@@ -253,7 +253,8 @@ def _turns(vectors: Tensor) -> Tensor:
     rows = torch.stack([none, -z, y, z, none, -x, -y, x, none], dim=-1)
     cross = rows.reshape(-1, 3, 3) / angle
     eye = torch.eye(3, device=vectors.device)
-    return eye + torch.sin(angle) * cross + (1.0 - torch.cos(angle)) * (cross @ cross)
+    turns: Tensor = eye + torch.sin(angle) * cross + (1.0 - torch.cos(angle)) * (cross @ cross)
+    return turns
 
 
 def _noisy(

@@ -94,7 +94,7 @@ class PopulationConfig(FitConfig):
     offset_sd: float = 0.005
     gain_sd: float = 0.03
     rest_sd: float = 0.02
-    stiffness_sd: float = 0.3
+    stiffness_sd: float = 0.0
     turn_sd: float = 0.0
     force_power: float = 0.5
 
