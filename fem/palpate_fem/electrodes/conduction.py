@@ -237,6 +237,17 @@ class FilmSolution:
         along, across = self._squares
         return self._by_film(along @ gradient, across @ gradient)
 
+    def gradient_log_sigma(self) -> Floats:
+        """dZ_i / d ln sigma [Ohm], shape (19,): less what the interface alone contributes."""
+        if self.contact_ohm_m2 == 0:
+            return -self.impedance
+        mesh = self.solver
+        zeta, _ = access_length(self.film[mesh.share_node], mesh.disc_radius_m)
+        transfer = 1 / (self.contact_ohm_m2 + zeta / self.sigma_s_m)
+        _, across = self._squares
+        at_interface = (mesh.share_area * transfer**2 * self.contact_ohm_m2) @ across
+        return np.asarray(at_interface - self.impedance)
+
     def _by_film(self, along: Floats, across: Floats) -> Floats:
         mesh = self.solver
         zeta, slope = access_length(self.film[mesh.share_node], mesh.disc_radius_m)

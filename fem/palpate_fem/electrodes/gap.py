@@ -386,14 +386,20 @@ def gap_adjustment(
         The share of the gap that stays open [1], and how much closer to the core the specimen's
         skin is [m], both of shape (N,): its gap is share * gap - closer.
     """
+    behind, sides = gap_profiles(points)
+    share = 1 - specimen.clamp_closing * behind
+    nearer = specimen.side_closing_m * sides
+    return share, nearer + share * (normals @ np.array(specimen.core_offset_m))
+
+
+def gap_profiles(points: Floats) -> tuple[Floats, Floats]:
+    """How far each point is behind the clamp's edge and to the sides, 0 to 1, both of shape (N,)."""
     x, y, z = points.T
     behind = 0.5 * (1 + np.tanh((CLAMP_X_M - x) / (2 * CLAMP_BLEND_M)))
     angle = np.arctan2(np.abs(y), -z)
     low, high = SIDES_RAD
     t = np.clip((angle - low) / (high - low), 0.0, 1.0)
-    share = 1 - specimen.clamp_closing * behind
-    nearer = specimen.side_closing_m * t * t * (3 - 2 * t)
-    return share, nearer + share * (normals @ np.array(specimen.core_offset_m))
+    return behind, t * t * (3 - 2 * t)
 
 
 def thickness(

@@ -1,0 +1,215 @@
+"""Touches of one real sensor that were held still, with their force: what a fit takes.
+
+A recording with a force sensor below the finger does not say where the finger was touched, nor by
+what. What it gives are counts and a force at the same time. Where a touch is held, both are free of
+the sensor's slow response and of the lag between the two instruments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import DatasetError
+from palpate.files.hdf5 import Hdf5Schema, opened, read_array, text
+from palpate_fem.electrodes.electronics import FULL_SCALE
+from palpate_fem.electrodes.specimen import SENSING
+
+Floats = NDArray[np.float64]
+
+FEATURES = Hdf5Schema("palpate.features", 1, "use a file made by `palpate data ingest-...`")
+COLUMNS = {"electrodes": "counts", "baseline": "counts", "force": "N", "sensor": "1", "group": "1"}
+
+HELD_ROWS = 50
+"""Half a second at 100 Hz."""
+
+STILL_COUNTS = 100.0
+"""A touch is held while no electrode moves by more, and another one if some electrode does [counts].
+
+Real ones creep: a hold of the force logs moves by 30 counts in a second, a change of place by 500.
+"""
+
+LEAST_N = 0.5
+"""Lighter touches are left out [N]: the force sensor's error is then a large share of the force."""
+
+_REMEDY = "give raw counts of E1..E19, untouched and touched, and the force on the sensor in N"
+
+
+@dataclass(frozen=True)
+class SensorTouches:
+    """Resting counts of one sensor, and touches with force, in order of time.
+
+    Attributes:
+        name: Of the sensor.
+        rest: Counts of the untouched sensor, shape (19,).
+        counts: Of each touch, raw, shape (N, 19).
+        force: On the sensor [N], sensor frame, shape (N, 3).
+
+    Raises:
+        DatasetError: Shapes do not fit together, a value is not finite or no count, there is no
+            rest, or a touch has no force.
+    """
+
+    name: str
+    rest: Floats
+    counts: Floats
+    force: Floats
+
+    def __post_init__(self) -> None:
+        for label, shape, wanted in (
+            ("rest", self.rest.shape, (SENSING,)),
+            ("counts", self.counts.shape, (len(self.counts), SENSING)),
+            ("force", self.force.shape, (len(self.counts), 3)),
+        ):
+            if shape != wanted:
+                raise DatasetError(
+                    f"{self.name}: {label} has shape {shape}, expected {wanted}", remedy=_REMEDY
+                )
+        for label, values in (("rest", self.rest), ("counts", self.counts), ("force", self.force)):
+            if not np.isfinite(values).all():
+                raise DatasetError(f"{self.name}: {label} is not finite", remedy=_REMEDY)
+        for label, values in (("rest", self.rest), ("counts", self.counts)):
+            if values.size and not (0 < values.min() and values.max() < FULL_SCALE):
+                raise DatasetError(
+                    f"{self.name}: {label} is from {values.min():g} to {values.max():g}, not within"
+                    f" 0 and {FULL_SCALE}",
+                    remedy="give raw counts, nothing subtracted; leave out electrodes at their end",
+                )
+        size = np.linalg.norm(self.force, axis=1)
+        if (size == 0).any():
+            raise DatasetError(
+                f"{self.name}: touch {int(np.argmin(size))} has no force",
+                remedy="give the force on the sensor in N for each touch",
+            )
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    @property
+    def tared(self) -> Floats:
+        """Counts minus those at rest, shape (N, 19)."""
+        return self.counts - self.rest
+
+    def some(self, chosen: slice | NDArray[np.integer]) -> SensorTouches:
+        """Some of the touches."""
+        return SensorTouches(self.name, self.rest, self.counts[chosen], self.force[chosen])
+
+
+def held(counts: Floats, *, rows: int = HELD_ROWS, still: float = STILL_COUNTS) -> list[slice]:
+    """Stretches of a recording in which all electrodes are still, longest first grown.
+
+    Args:
+        counts: In order of time, shape (T, 19).
+        rows: Shortest stretch.
+        still: See `STILL_COUNTS`.
+
+    Returns:
+        Stretches in order of time; of several in a row that differ by less than ``still`` in all
+        electrodes only the first, because they are one touch.
+    """
+    found: list[slice] = []
+    last: Floats | None = None
+    start = 0
+    while start + rows <= len(counts):
+        window = counts[start : start + rows]
+        low, high = window.min(axis=0), window.max(axis=0)
+        if (high - low).max() > still:
+            start += 1
+            continue
+        end = start + rows
+        while end < len(counts):
+            low, high = np.minimum(low, counts[end]), np.maximum(high, counts[end])
+            if (high - low).max() > still:
+                break
+            end += 1
+        mean = counts[start:end].mean(axis=0)
+        if last is None or np.abs(mean - last).max() > still:
+            found.append(slice(start, end))
+            last = mean
+        start = end
+    return found
+
+
+def touches_of(
+    name: str,
+    rest: Floats,
+    counts: Floats,
+    force: Floats,
+    *,
+    rows: int = HELD_ROWS,
+    still: float = STILL_COUNTS,
+) -> SensorTouches:
+    """Touches that were held, each the mean of its stretch.
+
+    Args:
+        name: Of the sensor.
+        rest: Counts of the untouched sensor, shape (19,).
+        counts: Raw, in order of time, shape (T, 19).
+        force: On the sensor [N], shape (T, 3).
+        rows: Shortest stretch.
+        still: See `STILL_COUNTS`.
+
+    Raises:
+        DatasetError: As `SensorTouches`; or nothing was held.
+    """
+    if rows < 1 or still <= 0:
+        raise DatasetError(
+            f"{name}: touches of {rows} rows that move by {still:g} counts",
+            remedy="give at least one row and more than 0 counts",
+        )
+    if len(counts) != len(force):
+        raise DatasetError(
+            f"{name}: {len(counts)} rows of counts, {len(force)} of force", remedy=_REMEDY
+        )
+    if not (np.isfinite(counts).all() and np.isfinite(force).all()):
+        raise DatasetError(f"{name}: counts or force are not finite", remedy=_REMEDY)
+    stretches = held(np.asarray(counts, np.float64), rows=rows, still=still)
+    means = [(counts[one].mean(axis=0), force[one].mean(axis=0)) for one in stretches]
+    kept = [pair for pair in means if np.linalg.norm(pair[1]) >= LEAST_N]
+    if not kept:
+        raise DatasetError(
+            f"{name}: no touch of {LEAST_N} N was held for {rows} rows",
+            remedy="hold each touch for half a second, or ask for fewer rows",
+        )
+    return SensorTouches(
+        name,
+        np.asarray(rest, np.float64),
+        np.array([one for one, _ in kept], np.float64),
+        np.array([one for _, one in kept], np.float64),
+    )
+
+
+def read_touches(path: Path, *, sensor: str = "", rows: int = HELD_ROWS) -> SensorTouches:
+    """Touches of one sensor of a data set (schema ``palpate.features``).
+
+    Args:
+        path: Made by ``palpate data ingest-...``: counts, untouched counts, forces.
+        sensor: Its name; empty = the only one.
+        rows: Shortest stretch that counts as held.
+
+    Raises:
+        DatasetError: Not such a file; a column is missing; the sensor is not there, or one of
+            several has to be named; or as `touches_of`.
+    """
+    with opened(path, extra="fem", missing="make it: palpate data ingest-record") as file:
+        FEATURES.check(path, file)
+        columns = {name: read_array(path, file, name, unit) for name, unit in COLUMNS.items()}
+        names = [text(name) for name in file.attrs.get("sensor_names", ())]
+    if sensor not in names and not (sensor == "" and len(names) == 1):
+        raise DatasetError(
+            f"{path}: {'no sensor ' + repr(sensor) if sensor else 'it holds several sensors'}",
+            remedy=f"name one of: {', '.join(names) or 'none'}",
+        )
+    mine = columns["sensor"] == (names.index(sensor) if sensor else 0)
+    if not mine.any():
+        raise DatasetError(f"{path}: no row of {sensor or names[0]}", remedy=_REMEDY)
+    return touches_of(
+        sensor or names[0],
+        columns["baseline"][mine].astype(np.float64).mean(axis=0),
+        columns["electrodes"][mine].astype(np.float64),
+        columns["force"][mine].astype(np.float64),
+        rows=rows,
+    )
