@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from palpate.rigid import rotation_matrices
 from palpate_deploy.experiment import parameters_of
 from palpate_fem.electrodes.electronics import PDC_PA
-from palpate_fem.indenter.shape import Indenter, Primitive, PrimitiveKind
+from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
@@ -36,11 +36,7 @@ from palpate_training.figures.plate import (
 Floats = NDArray[np.float64]
 
 OUT = Path(__file__).parent / "results" / "twin" / "plate.md"
-EDGE_M = 1e-3
-PLATE = Indenter(
-    "plate",
-    (Primitive(PrimitiveKind.BOX, (0.0, 0.0, -2.5e-3), (19e-3, 11e-3, 1.5e-3, 0.0), EDGE_M),),
-)
+PLATE = make_indenter("plate")
 STEP_M = 1e-4
 STEPS = 34
 WORDS = {1: "rises", -1: "falls", 0: "-"}

@@ -492,18 +492,51 @@ def serve(
     )
 
 
-@units_app.command(epilog="Example: palpate fem units fit runs/twin/mechanics.sim --out three.json")
+@units_app.command(
+    epilog=_example(
+        "palpate fem units fit runs/twin/mechanics.sim --out three.json",
+        "palpate fem units fit plate.sim --recording real.h5 --touches 12 --out mine.json",
+    )
+)
 def fit(
     store: Annotated[Path, typer.Argument(metavar="STORE", help="Simulated trajectories.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE.json", help="Where to write.")],
     overtravel_mm: Annotated[
         float, typer.Option(help="Depth of the paths beyond the paper's [mm].")
     ] = 0.6,
+    recording: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.h5",
+            help="One real sensor's counts with forces, from `palpate data ingest-...`: fit to it.",
+        ),
+    ] = None,
+    sensor: Annotated[
+        str, typer.Option(metavar="NAME", help="--recording: which of its sensors.")
+    ] = "",
+    touches: Annotated[
+        int | None,
+        typer.Option(
+            help="--recording: the first so many held touches; 0 = the rest alone; none = all."
+        ),
+    ] = None,
+    held_rows: Annotated[
+        int, typer.Option(min=1, help="--recording: rows for which a touch is held at least.")
+    ] = 50,
 ) -> None:
-    """Fit three specimens to the ranges and forces that the paper publishes."""
-    from palpate_fem.cli.identify import fit_units_command
+    """Fit three specimens to the ranges and forces that the paper publishes, or one to a sensor.
 
-    fit_units_command(store, out, overtravel_m=overtravel_mm * 1e-3)
+    With --recording, STORE holds presses like the sensor's, anywhere on the pad: which of them a
+    touch was is found with the specimen.
+    """
+    if recording is None:
+        from palpate_fem.cli.identify import fit_units_command
+
+        fit_units_command(store, out, overtravel_m=overtravel_mm * 1e-3)
+        return
+    from palpate_fem.cli.identify import fit_sensor_command
+
+    fit_sensor_command(store, out, recording, sensor=sensor, touches=touches, held_rows=held_rows)
 
 
 @units_app.command(epilog="Example: palpate fem units draw 20 --seed 1 --out drawn.json")

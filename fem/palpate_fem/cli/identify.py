@@ -42,7 +42,10 @@ from palpate_fem.population.members import (
     read_population,
     write_population,
 )
+from palpate_fem.population.press_library import read_library
 from palpate_fem.population.responses import geometry_of
+from palpate_fem.population.sensor_fit import fit_sensor
+from palpate_fem.population.touches import read_touches
 from palpate_fem.service.batch import PoolSimulator
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.trajectory import ANGLED_DEPTH_M, CLEARANCE_M, NORMAL_DEPTH_M
@@ -307,6 +310,43 @@ def fit_units_command(store: Path, out: Path, *, overtravel_m: float) -> None:
     print_lines(f"wrote {out}")
 
 
+def fit_sensor_command(
+    store: Path, out: Path, recording: Path, *, sensor: str, touches: int | None, held_rows: int
+) -> None:
+    """Fit one specimen to a recorded sensor on a store of presses, and write it."""
+    if touches is not None and touches < 0:
+        raise ConfigError(f"{touches} touches", remedy="give 0 for the rest alone, or more")
+    found = read_touches(recording, sensor=sensor, rows=held_rows)
+    some = found.some(slice(0, len(found) if touches is None else touches))
+    opened = SimulationStore.open(store)
+    model = ElectrodeModel(geometry_of(opened.fingertip()))
+    with progress_bar() as bar:
+        task = bar.add_task("films", total=len(opened.ids()))
+        library = read_library(opened, model, on_press=lambda: bar.advance(task))
+        bar.update(task, description="fit", total=None, info="")
+        fit = fit_sensor(
+            model,
+            library,
+            some,
+            on_round=lambda number, spread: bar.update(
+                task, info=f"round {number}: electrodes deviate by {spread:.0f} counts"
+            ),
+        )
+    member = fit.member(len(some))
+    source = f"{len(some)} touches of {found.name} on {library.presses} simulated presses"
+    write_population(out, [member], source=source)
+    print_table(
+        ("", found.name),
+        [(escape(label), f"{of(fit.specimen):.3g}") for label, of in ELECTRICAL],
+        title=f"fitted to the rest and {len(some)} of {len(found)} touches",
+        numbers_from=1,
+    )
+    lines = [f"counts at rest are left with {fit.rest_error:.0f} (root mean square)"]
+    if fit.learned is not None:
+        lines.append(f"electrodes of these touches deviate by {fit.learned.spread:.0f} counts")
+    print_lines(*lines, f"wrote {out}")
+
+
 def show_units_command(file: Path | None, *, as_json: bool) -> None:
     """Print a population."""
     members = read_population(file)
@@ -314,6 +354,29 @@ def show_units_command(file: Path | None, *, as_json: bool) -> None:
         typer.echo(json.dumps([member.to_dict() for member in members], indent=2))
     else:
         _show_members(members)
+
+
+ELECTRICAL: tuple[tuple[str, Callable[[SpecimenParameters], float]], ...] = (
+    ("conductivity [S/m]", lambda one: one.sigma_s_m),
+    ("series impedance [Ohm]", lambda one: one.series_ohm),
+    ("film closed by the clamp [1]", lambda one: one.clamp_closing),
+    ("sides closer to the core by [mm]", lambda one: one.side_closing_m * 1e3),
+    ("core displaced distally by [mm]", lambda one: one.core_offset_m[0] * 1e3),
+    ("core displaced to the left by [mm]", lambda one: one.core_offset_m[1] * 1e3),
+    ("core displaced upwards by [mm]", lambda one: one.core_offset_m[2] * 1e3),
+    ("film of an unloaded contact [um]", lambda one: one.asperity_m * 1e6),
+    ("film at infinite pressure [um]", lambda one: one.floor_m * 1e6),
+    ("squeeze pressure [kPa]", lambda one: one.squeeze_pa * 1e-3),
+    ("squeeze exponent [1]", lambda one: one.squeeze_exponent),
+)
+"""What specimens differ in, for people."""
+
+DRAWN = (
+    *ELECTRICAL,
+    ("noise [counts]", lambda one: one.noise_counts),
+    ("warms up by [K]", lambda one: one.heating_k),
+    ("with a time constant of [s]", lambda one: one.heating_tau_s),
+)
 
 
 def draw_units_command(count: int, seed: int, out: Path | None, *, as_json: bool) -> None:
@@ -324,21 +387,6 @@ def draw_units_command(count: int, seed: int, out: Path | None, *, as_json: bool
     if as_json:
         typer.echo(json.dumps([member.to_dict() for member in members], indent=2))
         return
-    rows: list[tuple[str, Callable[[SpecimenParameters], float]]] = [
-        ("conductivity [S/m]", lambda one: one.sigma_s_m),
-        ("series impedance [Ohm]", lambda one: one.series_ohm),
-        ("film closed by the clamp [1]", lambda one: one.clamp_closing),
-        ("sides closer to the core by [mm]", lambda one: one.side_closing_m * 1e3),
-        ("core displaced distally by [mm]", lambda one: one.core_offset_m[0] * 1e3),
-        ("core displaced to the left by [mm]", lambda one: one.core_offset_m[1] * 1e3),
-        ("core displaced upwards by [mm]", lambda one: one.core_offset_m[2] * 1e3),
-        ("film of an unloaded contact [um]", lambda one: one.asperity_m * 1e6),
-        ("film at infinite pressure [um]", lambda one: one.floor_m * 1e6),
-        ("squeeze pressure [kPa]", lambda one: one.squeeze_pa * 1e-3),
-        ("noise [counts]", lambda one: one.noise_counts),
-        ("warms up by [K]", lambda one: one.heating_k),
-        ("with a time constant of [s]", lambda one: one.heating_tau_s),
-    ]
     print_table(
         ("", "5 %", "median", "95 %"),
         [
@@ -351,7 +399,7 @@ def draw_units_command(count: int, seed: int, out: Path | None, *, as_json: bool
                     )
                 ),
             )
-            for label, of in rows
+            for label, of in DRAWN
         ],
         title=f"{count} specimens drawn with seed {seed}",
         numbers_from=1,

@@ -393,7 +393,7 @@ def gap_adjustment(
 
 
 def gap_profiles(points: Floats) -> tuple[Floats, Floats]:
-    """How far each point is behind the clamp's edge and to the sides, 0 to 1, both of shape (N,)."""
+    """How far points are behind the clamp's edge and to the sides, 0 to 1, both of shape (N,)."""
     x, y, z = points.T
     behind = 0.5 * (1 + np.tanh((CLAMP_X_M - x) / (2 * CLAMP_BLEND_M)))
     angle = np.arctan2(np.abs(y), -z)

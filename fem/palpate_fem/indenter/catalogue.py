@@ -190,6 +190,11 @@ def _texture() -> tuple[Primitive, ...]:
     return (*parts, *_narrowing(7e-3, 7e-3, -7.5e-3))
 
 
+def _plate() -> tuple[Primitive, ...]:
+    """40 x 24 mm, 5 mm thick: larger than what a finger touches of a table or a force sensor."""
+    return (_block(20e-3, 12e-3, -5e-3, 0.0, _EDGE_M),)
+
+
 _MAKERS: dict[str, Callable[[], tuple[Primitive, ...]]] = {
     "sphere_small": _sphere_small,
     "sphere_medium": lambda: _sphere_on_rod(3.5e-3),
@@ -201,6 +206,9 @@ _MAKERS: dict[str, Callable[[], tuple[Primitive, ...]]] = {
     "ring": _ring,
     "texture": _texture,
 }
+_BESIDE: dict[str, Callable[[], tuple[Primitive, ...]]] = {"plate": _plate}
+"""Not the paper's: to be named where they are wanted."""
+
 _FILLETS_M = {"texture": 0.5e-3}
 
 _SIZED = re.compile(r"(?P<kind>sphere|cylinder_short)_(?P<diameter>\d+(-\d+)?)mm")
@@ -238,8 +246,8 @@ def make_indenter(name: str) -> Indenter:
     """An indenter of the catalogue.
 
     Args:
-        name: One of `indenter_names`, or the public file's name, such as ``sphere_7mm``. Of spheres
-            and short cylinders there are other diameters, too: ``sphere_5mm``,
+        name: One of `indenter_names`, ``plate``, or the public file's name, such as ``sphere_7mm``.
+            Of spheres and short cylinders there are other diameters, too: ``sphere_5mm``,
             ``cylinder_short_4-5mm``; those above 7.2 mm narrow to the paper's base.
 
     Raises:
@@ -248,11 +256,12 @@ def make_indenter(name: str) -> Indenter:
     key = ALIASES.get(name, name)
     if (sized := _sized(key)) is not None:
         return Indenter(key, sized)
-    if key not in _MAKERS:
-        known = (*_MAKERS, *ALIASES)
+    makers = _MAKERS | _BESIDE
+    if key not in makers:
+        known = (*makers, *ALIASES)
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
         raise ConfigError(
             f"there is no indenter {name!r}",
-            remedy=f"did you mean {near[0]!r}? known: {', '.join(_MAKERS)}",
+            remedy=f"did you mean {near[0]!r}? known: {', '.join(makers)}",
         )
-    return Indenter(key, _MAKERS[key](), _FILLETS_M.get(key, 0.0))
+    return Indenter(key, makers[key](), _FILLETS_M.get(key, 0.0))

@@ -61,10 +61,11 @@ class Member:
 
     Attributes:
         specimen: Its electrical parameters.
-        published: What it was fitted to; None = it was drawn.
+        published: What it was fitted to; None = it was drawn, or fitted to a real sensor.
         overtravel_m: How much deeper it was pressed than planned [m]: the share of the robot's
             registration error that points into the skin.
-        found: Result of the fit: ``low``, ``high``, ``max_force_n``, ``states``.
+        found: Result of the fit: ``low``, ``high``, ``max_force_n``, ``states``; to a real sensor:
+            ``touches``, ``rest_error_counts``, ``spread_counts``, ``warmth``.
     """
 
     specimen: SpecimenParameters

@@ -31,8 +31,9 @@ class Candidates:
     """States that answer the forces of N touches, one for each of J presses; between two steps.
 
     Attributes:
-        low: Step before, index into the library, shape (N, J); -1 = the press does not reach it.
-        high: Step after, shape (N, J).
+        low: Step before, index into the library, shape (N, J); 0 where the press does not reach
+            the force.
+        high: Step after, likewise.
         share: Of the step after, 0 to 1, shape (N, J).
         angle_rad: Between the simulated and the measured force, shape (N, J); infinite where there
             is no candidate.
@@ -42,6 +43,12 @@ class Candidates:
     high: Indices
     share: Floats
     angle_rad: Floats
+
+    @property
+    def states(self) -> Indices:
+        """All states that are between, in order."""
+        there = np.isfinite(self.angle_rad)
+        return np.union1d(self.low[there], self.high[there])
 
     def at(self, values: Floats) -> Floats:
         """Values of states, (S, ...), at the candidates, (N, J, ...)."""
@@ -57,6 +64,7 @@ class PressLibrary:
         rest: Gap of the untouched finger.
         gaps: Of the S states.
         force: Net force of the indenter on the skin [N], shape (S, 3).
+        place: Centre of its pressure [m], shape (S, 3), sensor frame.
         press: Which press each belongs to, 0 to J - 1 in order, shape (S,).
 
     Raises:
@@ -66,14 +74,16 @@ class PressLibrary:
     rest: Gap
     gaps: Sequence[Gap]
     force: Floats
+    place: Floats
     press: Indices
 
     def __post_init__(self) -> None:
         count = len(self.gaps)
-        if not count or self.force.shape != (count, 3) or self.press.shape != (count,):
+        shapes = self.force.shape, self.place.shape, self.press.shape
+        if not count or shapes != ((count, 3), (count, 3), (count,)):
             raise DatasetError(
-                f"{count} states, forces of shape {self.force.shape}, presses {self.press.shape}",
-                remedy="simulate presses that touch, and give one force for each state",
+                f"{count} states, their forces, places and presses have shapes {shapes}",
+                remedy="simulate presses that touch, and give one of each for each state",
             )
 
     @property
@@ -143,6 +153,7 @@ def read_library(
     nodes = fingertip.pressurised_nodes
     gaps: list[Gap] = []
     force: list[Floats] = []
+    place: list[Floats] = []
     press: list[int] = []
     number = 0
     for name in store.ids():
@@ -151,6 +162,7 @@ def read_library(
         some = [step for step in steps if np.linalg.norm(step.force) >= LEAST_N]
         gaps += [sensor.finder.of_step(nodes, step) for step in some]
         force += [step.force for step in some]
+        place += [step.centre_of_pressure for step in some]
         press += [number] * len(some)
         number += bool(some)
         if on_press is not None:
@@ -158,5 +170,9 @@ def read_library(
     if not gaps:
         raise DatasetError(f"{store.path} holds no step that touches", remedy="simulate presses")
     return PressLibrary(
-        sensor.finder.measure(nodes), gaps, np.array(force), np.array(press, np.int64)
+        sensor.finder.measure(nodes),
+        gaps,
+        np.array(force),
+        np.array(place),
+        np.array(press, np.int64),
     )

@@ -7,10 +7,9 @@ these probabilities the specimen is fitted by Gauss-Newton steps, whose derivati
 exactly (`electrodes.sensitivity`). Priors of the parameters are part of the residuals, so what the
 touches do not say stays at the prior.
 
-Two things belong to the touches and not to the specimen. The core warms up after the rest was
-taken, so each touch has its own change of the conductivity, small by its prior. And no simulated
-press is the real one: the standard deviation of what is left, the same for all electrodes, is
-estimated with the rest.
+Three things belong to the touches and not to the specimen, and are estimated with it: each touch's
+warmth, because the core warms up after the rest was taken; where the recording was touched, given
+the force; and the deviation of the electrodes from the nearest press, because none is the real one.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from palpate.errors import DatasetError
 from palpate_fem.electrodes.gap import Gap
 from palpate_fem.electrodes.model import ElectrodeModel
-from palpate_fem.electrodes.sensitivity import AXES, counts_by_log_sigma, counts_by_parameters
+from palpate_fem.electrodes.sensitivity import AXES, counts_by_parameters
 from palpate_fem.electrodes.specimen import LIMITS, LOG_SD, SENSING, SpecimenParameters
+from palpate_fem.population.explain import Explanation, TouchExplainer, TouchPrior
 from palpate_fem.population.members import (
     CLAMP_CLOSING,
     CORE_FORWARD_M,
@@ -37,6 +36,7 @@ from palpate_fem.population.members import (
     SIDE_CLOSING_M,
     SIGMA_LOG_SD,
     SIGMA_S_M,
+    Member,
 )
 from palpate_fem.population.press_library import Candidates, PressLibrary
 from palpate_fem.population.touches import SensorTouches
@@ -44,22 +44,11 @@ from palpate_fem.population.touches import SensorTouches
 Floats = NDArray[np.float64]
 OnRound = Callable[[int, float], None]
 
-WARMTH_SD = 0.06
-"""Of ln of the conductivity between rest and a touch: the idle sensor beside rose by up to 9 %."""
-
-ANGLE_SD_RAD = math.radians(20.0)
-"""Between the measured and the simulated force: friction differs, and the axes of the real force
-are only known by correlation."""
-
-SPREAD = 200.0
-"""Deviation of the electrodes that the fit begins with [counts]: broad, so that no press is ruled
-out by the specimen that it starts from."""
 REST_SPREAD = 50.0
 """Of counts at rest when they are all that is fitted: what fits leave of real ones
 (docs/results/twin/units.md)."""
-LEAST_SPREAD = 5.0
-KEPT = 4
-"""Presses for each touch that a fit of the specimen uses, the most probable ones."""
+KEPT, LEAST_PROBABILITY = 4, 0.02
+"""Presses for each touch that a fit of the specimen uses: the most probable, and how probable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +83,7 @@ class ParameterPrior:
         return raw / self.sd
 
     def slope(self, value: float) -> float:
-        """d parameter / d scaled, at a parameter."""
+        """Derivative of the parameter by its scaled value, at a parameter."""
         return self.sd * (value if self.log else 1.0)
 
 
@@ -127,17 +116,11 @@ ASYMMETRY = ParameterPrior("asymmetry", 1.0, LOG_SD["asymmetry"], *_limits("asym
 """Of each electrode's factor, 19 of them."""
 
 
-def scaled_of(specimen: SpecimenParameters) -> Floats:
-    """Parameters of a specimen in standard deviations of the priors, shape (11 + 19,)."""
-    core = dict(zip(AXES, specimen.core_offset_m, strict=True))
-    plain = [
-        p.scaled(core[p.name] if p.name in core else getattr(specimen, p.name)) for p in PRIORS
-    ]
-    return np.array([*plain, *(ASYMMETRY.scaled(one) for one in specimen.asymmetry)])
-
-
 def specimen_at(scaled: Floats, start: SpecimenParameters) -> SpecimenParameters:
-    """The specimen with these parameters; all others are those of ``start``."""
+    """The specimen with parameters in standard deviations of their priors, shape (11 + 19,).
+
+    All others are those of ``start``.
+    """
     values = {p.name: p.value(float(s)) for p, s in zip(PRIORS, scaled, strict=False)}
     core = tuple(values.pop(axis) for axis in AXES)
     asymmetry = tuple(ASYMMETRY.value(float(s)) for s in scaled[len(PRIORS) :])
@@ -145,135 +128,27 @@ def specimen_at(scaled: Floats, start: SpecimenParameters) -> SpecimenParameters
 
 
 @dataclass(frozen=True)
-class Explanation:
-    """What presses of a library say of touches, under one specimen.
-
-    Attributes:
-        tared: Expected counts minus those at rest, shape (N, 19).
-        probability: Of each press, shape (N, J); rows sum to one.
-        warmth: Expected ln of the conductivity over that at rest, by press, shape (N, J).
-        left: Root mean square of given counts minus those of each press, weighted by their
-            probability [counts]; NaN if no electrode was given.
-    """
-
-    tared: Floats
-    probability: Floats
-    warmth: Floats
-    left: float
-
-    @property
-    def mean_warmth(self) -> Floats:
-        """Expected warmth of each touch, shape (N,)."""
-        return np.asarray((self.probability * self.warmth).sum(axis=1))
-
-
-class TouchExplainer:
-    """A specimen that is asked which presses of a library some touches were, and what it reads."""
-
-    def __init__(self, model: ElectrodeModel, library: PressLibrary) -> None:
-        """Nothing is computed yet.
-
-        Args:
-            model: The specimen, on the library's fingertip.
-            library: Simulated presses.
-        """
-        self.model, self._library = model, library
-        self._rest = model.of_gap(library.rest).counts
-        self._known: dict[int, tuple[Floats, Floats]] = {}
-
-    def _tared(self, places: Candidates) -> tuple[Floats, Floats]:
-        """Tared counts of candidates and their derivative by ln sigma, each (N, J, 19)."""
-        some = np.isfinite(places.angle_rad)
-        for state in np.union1d(places.low[some], places.high[some]).tolist():
-            if state not in self._known:
-                answer = self.model.of_gap(self._library.gaps[state])
-                self._known[state] = (answer.counts, counts_by_log_sigma(self.model, answer))
-        size = len(self._library.gaps)
-        counts, warm = np.zeros((size, SENSING)), np.zeros((size, SENSING))
-        for state, (one, other) in self._known.items():
-            counts[state], warm[state] = one, other
-        return places.at(counts) - self._rest, places.at(warm)
-
-    def explain(
-        self,
-        touches: SensorTouches,
-        *,
-        spread: float,
-        given: NDArray[np.bool_] | None = None,
-        warmth: float = 0.0,
-        places: Candidates | None = None,
-    ) -> Explanation:
-        """Find the presses, and what the electrodes are expected to read.
-
-        Args:
-            touches: With forces; of the counts only those of the given electrodes are used.
-            spread: Standard deviation of an electrode from the simulated one [counts].
-            given: Electrodes whose counts are known, shape (19,); None = all. With none the force
-                alone decides.
-            warmth: Expected ln of the conductivity over that at rest.
-            places: Of the library for these forces; None = they are found.
-
-        Raises:
-            DatasetError: A force is beyond all presses.
-        """
-        if places is None:
-            places = self._library.candidates(touches.force)
-        tared, warm = self._tared(places)
-        known = np.ones(SENSING, bool) if given is None else given
-        off = touches.tared[:, None, known] - tared[..., known] - warmth * warm[..., known]
-        slope = warm[..., known]
-        # The best warmth of each candidate, and what the electrodes and its prior then cost.
-        rise = (slope * off).sum(axis=2) / ((slope**2).sum(axis=2) + (spread / WARMTH_SD) ** 2)
-        left = off - rise[..., None] * slope
-        cost = (left**2).sum(axis=2) / spread**2 + (rise / WARMTH_SD) ** 2
-        cost = cost + (places.angle_rad / ANGLE_SD_RAD) ** 2
-        cost -= cost.min(axis=1, keepdims=True)
-        probability = np.exp(-0.5 * cost)
-        probability /= probability.sum(axis=1, keepdims=True)
-        expected = tared + (warmth + rise)[..., None] * warm
-        square = float((probability[..., None] * left**2).sum())
-        count = len(touches) * int(known.sum())
-        return Explanation(
-            np.einsum("nj,nji->ni", probability, expected),
-            probability,
-            warmth + rise,
-            math.sqrt(square / count) if count else math.nan,
-        )
-
-    def spread_of(self, touches: SensorTouches, *, rounds: int = 8) -> tuple[float, Explanation]:
-        """Deviation of the electrodes from this specimen's, with the presses that fit best.
-
-        Raises:
-            DatasetError: There is no touch, or a force is beyond all presses.
-        """
-        if not len(touches):
-            raise DatasetError("no touch to compare with", remedy="give at least one")
-        places = self._library.candidates(touches.force)
-        spread = SPREAD
-        for _ in range(rounds):
-            found = self.explain(touches, spread=spread, places=places)
-            spread = max(found.left, LEAST_SPREAD)
-        return spread, found
-
-
-@dataclass(frozen=True)
 class SensorFit:
     """A specimen that was fitted to a sensor.
 
     Attributes:
-        specimen: The specimen.
-        spread: Deviation of the electrodes from what it reads at the presses that fit best
-            [counts]; NaN without touches.
+        specimen: The specimen, with the sensor's name.
         rest_error: Root mean square of the counts at rest minus its own [counts].
-        warmth: Mean ln of the conductivity of the touches over that at rest; 0 without touches.
+        learned: What its touches teach of others of the same recording; None without touches.
         rounds: To and fro.
     """
 
     specimen: SpecimenParameters
-    spread: float
     rest_error: float
-    warmth: float
+    learned: TouchPrior | None
     rounds: int
+
+    def member(self, touches: int) -> Member:
+        """As a member of a population, with what the fit found."""
+        found = {"touches": float(touches), "rest_error_counts": self.rest_error}
+        if self.learned is not None:
+            found |= {"spread_counts": self.learned.spread, "warmth": self.learned.warmth}
+        return Member(self.specimen, None, 0.0, found)
 
 
 def fit_sensor(
@@ -287,42 +162,38 @@ def fit_sensor(
     """Fit a specimen to a sensor's rest and touches.
 
     Args:
-        sensor: Model on the library's fingertip; parameters that are not fitted are its own, and
-            discs and recess too.
+        sensor: Model on the library's fingertip; parameters that are not fitted are its own.
         library: Simulated presses.
         touches: Of the sensor; with none the rest alone is fitted.
         rounds: To and fro, at most; it ends earlier when the spread moves by less than 1 %.
-        on_round: Called after each with its number and the spread.
+        on_round: Called after each with its number and the spread [counts].
 
     Raises:
         DatasetError: A force is beyond all presses of the library.
     """
-    rest_only = touches.some(slice(0, 0))
-    scaled = _fitted(sensor, library, rest_only, np.zeros(len(PRIORS) + SENSING), [], REST_SPREAD)
-    spread, warmth, done = math.nan, 0.0, 0
-    if len(touches):
-        places = library.candidates(touches.force)
-        spread = SPREAD
+    places = library.candidates(touches.force) if len(touches) else None
+    start = np.zeros(len(PRIORS) + SENSING)
+    at = _fitted(sensor, library, touches, start, [], REST_SPREAD)
+    prior, done = TouchPrior(), 0
+    if places is not None:
         for done in range(1, rounds + 1):
-            model = sensor.with_specimen(specimen_at(scaled, sensor.specimen))
-            found = TouchExplainer(model, library).explain(touches, spread=spread, places=places)
-            before, spread = spread, max(found.left, LEAST_SPREAD)
-            warmth = float(found.mean_warmth.mean())
+            model = sensor.with_specimen(specimen_at(at, sensor.specimen))
+            found = TouchExplainer(model, library).explain(touches, prior, places=places)
+            before, prior = prior, found.learned
             if on_round is not None:
-                on_round(done, spread)
-            if abs(spread / before - 1) < 0.01:
+                on_round(done, prior.spread)
+            if abs(prior.spread / before.spread - 1) < 0.01:
                 break
-            pairs = _pairs(places, found)
-            scaled = _fitted(sensor, library, touches, scaled, pairs, spread)
-    specimen = specimen_at(scaled, sensor.specimen)
+            at = _fitted(sensor, library, touches, at, _pairs(places, found), prior.spread)
+    specimen = replace(specimen_at(at, sensor.specimen), name=touches.name)
     rest = sensor.with_specimen(specimen).of_gap(library.rest).counts
     error = float(np.sqrt(np.mean((rest - touches.rest) ** 2)))
-    return SensorFit(replace(specimen, name=touches.name), spread, error, warmth, done)
+    return SensorFit(specimen, error, prior if len(touches) else None, done)
 
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """A touch and one of its presses."""
+    """A touch and one of its probable presses, between two states."""
 
     touch: int
     low: int
@@ -336,7 +207,7 @@ def _pairs(places: Candidates, found: Explanation) -> list[_Pair]:
     pairs = []
     for n, row in enumerate(found.probability):
         best = np.argsort(-row)[:KEPT]
-        best = best[row[best] > 0.02]
+        best = best[row[best] > LEAST_PROBABILITY]
         total = float(row[best].sum())
         pairs += [
             _Pair(

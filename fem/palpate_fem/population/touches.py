@@ -27,10 +27,8 @@ HELD_ROWS = 50
 """Half a second at 100 Hz."""
 
 STILL_COUNTS = 100.0
-"""A touch is held while no electrode moves by more, and another one if some electrode does [counts].
-
-Real ones creep: a hold of the force logs moves by 30 counts in a second, a change of place by 500.
-"""
+"""A touch is held while no electrode moves by more [counts], and it is another if one does. Real
+ones creep by some tens of counts; a change of place moves them by hundreds."""
 
 LEAST_N = 0.5
 """Lighter touches are left out [N]: the force sensor's error is then a large share of the force."""
