@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +122,9 @@ def specimen_at(scaled: Floats, start: SpecimenParameters) -> SpecimenParameters
 
     All others are those of ``start``.
     """
-    values = {p.name: p.value(float(s)) for p, s in zip(PRIORS, scaled, strict=False)}
+    values: dict[str, Any] = {
+        p.name: p.value(float(s)) for p, s in zip(PRIORS, scaled, strict=False)
+    }
     core = tuple(values.pop(axis) for axis in AXES)
     asymmetry = tuple(ASYMMETRY.value(float(s)) for s in scaled[len(PRIORS) :])
     return replace(start, **values, core_offset_m=core, asymmetry=asymmetry)

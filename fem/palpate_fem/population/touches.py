@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from palpate_fem.electrodes.specimen import SENSING
 Floats = NDArray[np.float64]
 
 FEATURES = Hdf5Schema("palpate.features", 1, "use a file made by `palpate data ingest-...`")
-COLUMNS = {"electrodes": "counts", "baseline": "counts", "force": "N", "sensor": "1", "group": "1"}
+COLUMNS = {"electrodes": "counts", "baseline": "counts", "force": "N", "sensor": "1"}
 
 HELD_ROWS = 50
 """Half a second at 100 Hz."""
@@ -91,7 +92,7 @@ class SensorTouches:
         """Counts minus those at rest, shape (N, 19)."""
         return self.counts - self.rest
 
-    def some(self, chosen: slice | NDArray[np.integer]) -> SensorTouches:
+    def some(self, chosen: slice | NDArray[np.integer[Any]]) -> SensorTouches:
         """Some of the touches."""
         return SensorTouches(self.name, self.rest, self.counts[chosen], self.force[chosen])
 

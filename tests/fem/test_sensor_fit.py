@@ -1,0 +1,308 @@
+"""A planted sensor is found again from its rest and a few touches; bad recordings are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from palpate.errors import ConfigError, DatasetError
+from palpate_fem.cli.app import fem_app
+from palpate_fem.config import FingertipParameters
+from palpate_fem.electrodes.gap import Gap
+from palpate_fem.electrodes.model import ElectrodeModel
+from palpate_fem.electrodes.specimen import SENSING, SpecimenParameters
+from palpate_fem.indenter.catalogue import make_indenter
+from palpate_fem.mechanics.solver import Fingertip
+from palpate_fem.mesh.parametric import biotac
+from palpate_fem.population.explain import TouchExplainer, TouchPrior
+from palpate_fem.population.members import read_population
+from palpate_fem.population.press_library import PressLibrary
+from palpate_fem.population.responses import Population
+from palpate_fem.population.sensor_fit import fit_sensor
+from palpate_fem.population.touches import FEATURES, SensorTouches, held, read_touches, touches_of
+from palpate_fem.service.biotac import BiotacTip
+from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.writer import StoreWriter
+
+Floats = NDArray[np.float64]
+
+NOISE_COUNTS = 4.0
+PLANTED = SpecimenParameters(
+    name="planted",
+    sigma_s_m=0.14,
+    series_ohm=700.0,
+    side_closing_m=0.12e-3,
+    clamp_closing=0.3,
+    core_offset_m=(0.6e-3, 0.05e-3, -0.4e-3),
+    asperity_m=110e-6,
+    squeeze_pa=45e3,
+    squeeze_exponent=0.7,
+)
+STEPS_N = (1.0, 3.0, 5.0, 7.0)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A model, a library of dents, and the sensor that is to be found."""
+
+    model: ElectrodeModel
+    library: PressLibrary
+    touches: SensorTouches
+    later: SensorTouches
+
+
+def dent(model: ElectrodeModel, rest: Gap, place: Floats, force_n: float) -> Gap:
+    """The film of a finger that is pressed over a place of the core: closed there, open around."""
+    away = np.linalg.norm(model.film.nodes - place, axis=1)
+    inside = np.exp(-((away / 3e-3) ** 2)) * min(force_n / 2.5, 1.0)
+    bulge = 0.08e-3 * force_n / 5 * (1 - inside)
+    return replace(rest, gap=rest.gap * (1 - inside) + bulge, pressure=4e4 * force_n * inside**4)
+
+
+@pytest.fixture(scope="module")
+def bench() -> Bench:
+    model = ElectrodeModel(biotac(edge_m=0.8e-3), edge_m=0.9e-3)
+    rest = model.finder.measure(model.geometry.mesh.nodes)
+    nodes, normals = model.film.nodes, model.film.normals
+    rng = np.random.default_rng(4)
+    pad = np.flatnonzero((normals[:, 2] < -0.3) & (nodes[:, 0] > -11e-3))
+    presses = [nodes[pad[0]]]
+    for _ in range(23):  # far from one another
+        away = np.linalg.norm(nodes[pad][:, None] - np.array(presses), axis=2).min(axis=1)
+        presses.append(nodes[pad[int(np.argmax(away))]])
+    order = rng.permutation(len(presses))
+    gaps, force, place, number = [], [], [], []
+    for j, at in enumerate(presses):
+        inwards = -normals[np.argmin(np.linalg.norm(nodes - at, axis=1))]
+        for size in STEPS_N:
+            gaps.append(dent(model, rest, at, size))
+            force.append(size * inwards)
+            place.append(at)
+            number.append(j)
+    library = PressLibrary(rest, gaps, np.array(force), np.array(place), np.array(number, np.int64))
+    sensor = model.with_specimen(PLANTED)
+    counts, measured = [], []
+    for k, j in enumerate(order):
+        size = 2.0 + 0.2 * k
+        warmth = 0.05 + 0.002 * k
+        answer = sensor.of_gap(dent(model, rest, presses[j], size), log_sigma=warmth)
+        counts.append(answer.counts + NOISE_COUNTS * rng.standard_normal(SENSING))
+        turned = force[4 * j] + 0.1 * rng.standard_normal(3)
+        measured.append(size * turned / np.linalg.norm(turned))
+    touches = SensorTouches(
+        "planted", sensor.of_gap(rest).counts, np.array(counts), np.array(measured)
+    )
+    return Bench(model, library, touches.some(slice(0, 8)), touches.some(slice(8, 24)))
+
+
+def explained(bench: Bench, specimen: SpecimenParameters) -> float:
+    """Share of the later touches' variance, each electrode told from five others."""
+    explainer = TouchExplainer(bench.model.with_specimen(specimen), bench.library)
+    prior = explainer.learn(bench.touches).learned
+    left = total = 0.0
+    away = bench.later.tared - bench.later.tared.mean(axis=0)
+    for k in range(4):
+        given = np.arange(SENSING) % 4 == k
+        told = explainer.explain(bench.later, prior, given=given).tared
+        left += float(((told - bench.later.tared)[:, ~given] ** 2).sum())
+        total += float((away[:, ~given] ** 2).sum())
+    return 1 - left / total
+
+
+def misses(specimen: SpecimenParameters) -> dict[str, float]:
+    """Errors of what touches decide, in standard deviations of the priors."""
+    return {
+        "ln sigma": abs(np.log(specimen.sigma_s_m / PLANTED.sigma_s_m)) / 0.7,
+        "sides": abs(specimen.side_closing_m - PLANTED.side_closing_m) / 0.144e-3,
+        "core x": abs(specimen.core_offset_m[0] - PLANTED.core_offset_m[0]) / 0.58e-3,
+        "core z": abs(specimen.core_offset_m[2] - PLANTED.core_offset_m[2]) / 0.38e-3,
+    }
+
+
+def test_a_planted_sensor_is_found_and_its_later_touches_are_told(bench: Bench) -> None:
+    nominal = SpecimenParameters()
+    rest = fit_sensor(bench.model, bench.library, bench.touches.some(slice(0, 0)))
+    rounds: list[float] = []
+    fit = fit_sensor(
+        bench.model, bench.library, bench.touches, on_round=lambda _, spread: rounds.append(spread)
+    )
+    assert rounds[-1] < 0.5 * rounds[0]
+    assert fit.learned is not None
+    assert fit.learned.warmth == pytest.approx(0.057, abs=0.03)
+    for name, before in misses(nominal).items():
+        assert misses(fit.specimen)[name] < 0.3 * before, name
+    by_touches = explained(bench, fit.specimen)
+    assert by_touches > 0.97
+    assert by_touches > explained(bench, rest.specimen) + 0.02
+    assert by_touches > explained(bench, nominal) + 0.5
+
+
+def test_without_touches_only_the_rest_is_fitted(bench: Bench) -> None:
+    fit = fit_sensor(bench.model, bench.library, bench.touches.some(slice(0, 0)))
+    nominal = bench.model.of_gap(bench.library.rest).counts
+    before = float(np.sqrt(np.mean((nominal - bench.touches.rest) ** 2)))
+    assert fit.rest_error < 0.2 * before
+    assert fit.learned is None
+    assert "touches" in fit.member(0).found
+
+
+def test_the_press_that_a_touch_was_is_found_without_most_electrodes(bench: Bench) -> None:
+    explainer = TouchExplainer(bench.model.with_specimen(PLANTED), bench.library)
+    whole = explainer.explain(bench.later, TouchPrior(spread=20.0))
+    some = np.arange(SENSING) % 4 == 0
+    part = explainer.explain(bench.later, TouchPrior(spread=20.0), given=some)
+    np.testing.assert_allclose(whole.probability.sum(axis=1), 1.0)
+    same = whole.probability.argmax(axis=1) == part.probability.argmax(axis=1)
+    assert same.mean() > 0.8
+    # What is not given must not matter.
+    hidden = replace(bench.later, counts=np.where(some, bench.later.counts, 2000.0))
+    again = explainer.explain(hidden, TouchPrior(spread=20.0), given=some)
+    np.testing.assert_array_equal(part.tared, again.tared)
+
+
+def test_a_touch_beyond_all_presses_is_refused(bench: Bench) -> None:
+    hard = replace(bench.touches, force=10 * bench.touches.force)
+    with pytest.raises(DatasetError, match="beyond all simulated presses"):
+        fit_sensor(bench.model, bench.library, hard)
+    with pytest.raises(DatasetError, match="no touch to explain"):
+        TouchExplainer(bench.model, bench.library).learn(bench.touches.some(slice(0, 0)))
+
+
+def test_candidates_have_the_measured_size_of_force(bench: Bench) -> None:
+    found = bench.library.candidates(bench.later.force)
+    there = np.isfinite(found.angle_rad)
+    assert there.any(axis=1).all()
+    size = np.linalg.norm(found.at(bench.library.force), axis=2)
+    wanted = np.broadcast_to(np.linalg.norm(bench.later.force, axis=1)[:, None], size.shape)
+    np.testing.assert_allclose(size[there], wanted[there], rtol=1e-9)
+
+
+def recording() -> tuple[Floats, Floats]:
+    """Three holds; the second moves too little to be another touch, and one is too short."""
+    rng = np.random.default_rng(0)
+    levels = np.repeat([2000.0, 2050.0, 2600.0, 2900.0], [60, 70, 80, 20])
+    counts = levels[:, None] + rng.uniform(-5, 5, (len(levels), SENSING))
+    return counts, np.tile([0.0, 0.0, 4.0], (len(levels), 1))
+
+
+def test_a_touch_is_what_was_held_and_differs_from_the_one_before() -> None:
+    counts, force = recording()
+    stretches = held(counts)
+    assert [(one.start, one.stop) for one in stretches] == [(0, 130), (130, 210)]
+    touches = touches_of("mine", np.full(SENSING, 2500.0), counts, force)
+    np.testing.assert_allclose(touches.counts.mean(axis=1), [2027, 2600], atol=3)
+    assert len(held(counts, rows=90)) == 1
+
+
+REST = np.full(SENSING, 2500.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"rest": np.full(SENSING, np.nan)}, "rest is not finite"),
+        ({"rest": np.zeros(SENSING)}, "rest is from 0"),
+        ({"rest": np.zeros(0)}, "rest has shape"),
+        ({"counts": np.zeros((0, SENSING))}, "force has shape"),
+        ({"counts": np.full((2, 24), 2000.0)}, "counts has shape"),
+        ({"counts": np.full((2, SENSING), np.nan)}, "counts is not finite"),
+        ({"counts": np.full((2, SENSING), -20.0)}, "raw counts"),
+        ({"force": np.zeros((2, 3))}, "has no force"),
+        ({"force": np.full((2, 3), np.inf)}, "force is not finite"),
+    ],
+)
+def test_touches_that_make_no_sense_are_refused(changes: dict[str, Floats], words: str) -> None:
+    good = {"rest": REST, "counts": np.full((2, SENSING), 2000.0), "force": np.ones((2, 3))}
+    with pytest.raises(DatasetError, match=words):
+        SensorTouches("mine", **(good | changes))
+
+
+def write_recording(
+    path: Path,
+    *,
+    rows_of: tuple[Floats, Floats, Floats] | None = None,
+    leave_out: str = "",
+    names: tuple[str, ...] = ("mine",),
+) -> Path:
+    rest, counts, force = rows_of or (REST, *recording())
+    rows = len(counts)
+    columns: dict[str, tuple[str, Any]] = {
+        "electrodes": ("counts", counts.astype(np.uint16)),
+        "baseline": ("counts", np.tile(rest, (rows, 1)).astype(np.float32)),
+        "force": ("N", force.astype(np.float32)),
+        "sensor": ("1", np.zeros(rows, np.int32)),
+    }
+    with h5py.File(path, "w") as file:
+        file.attrs.update({**FEATURES.facts, "sensor_names": list(names)})
+        for name, (unit, values) in columns.items():
+            if name != leave_out:
+                file.create_dataset(name, data=values).attrs["unit"] = unit
+    return path
+
+
+def test_a_recording_is_read_or_refused(tmp_path: Path) -> None:
+    good = write_recording(tmp_path / "good.h5")
+    touches = read_touches(good)
+    assert (touches.name, len(touches)) == ("mine", 2)
+    assert len(read_touches(good, sensor="mine", rows=75)) == 2
+    two = write_recording(tmp_path / "two.h5", names=("mine", "yours"))
+    cases: list[tuple[Callable[[], object], str]] = [
+        (lambda: read_touches(tmp_path / "no.h5"), "no such file"),
+        (lambda: read_touches(good, sensor="yours"), "no sensor 'yours'"),
+        (lambda: read_touches(two), "several sensors"),
+        (lambda: read_touches(two, sensor="yours"), "no row of yours"),
+        (lambda: read_touches(good, rows=500), "was held"),
+        (lambda: read_touches(good, rows=0), "at least one row"),
+    ]
+    for name in ("electrodes", "baseline", "force", "sensor"):
+        without = write_recording(tmp_path / f"{name}.h5", leave_out=name)
+        cases.append((lambda path=without: read_touches(path), f"'{name}' is missing"))  # type: ignore[misc]
+    for call, words in cases:
+        with pytest.raises(DatasetError, match=words):
+            call()
+
+
+def test_the_command_writes_a_population_that_the_twin_takes(tmp_path: Path) -> None:
+    geometry = biotac(edge_m=1.4e-3)
+    tip = Fingertip.pressurised(geometry, FingertipParameters(fluid_volume_m3=6e-7))
+    plate = make_indenter("plate")
+    sensor = ElectrodeModel(geometry, PLANTED)
+    counts, force = [], []
+    with StoreWriter(tmp_path / "plate.sim", BiotacTip(tip).describe()) as store:
+        for k, lean in enumerate((-0.5, -0.2, 0.1)):
+            normal = np.array([np.sin(lean), 0.0, np.cos(lean)])
+            start = tip.nodes[np.argmin(tip.nodes @ normal)] - 2e-6 * normal
+            turn = [np.cos(lean / 2), 0.0, np.sin(lean / 2), 0.0]
+            path = np.array([[*(start + 0.4e-3 * i * normal), *turn] for i in range(6)])
+            pressed = tip.indent(plate, path)
+            store.write(f"plate/{k}/tilted", pressed)
+            step = pressed.steps[-2]
+            gap = sensor.finder.of_step(tip.nodes, step)
+            counts.append(sensor.of_gap(gap).counts)
+            force.append(step.force)
+    rest = sensor.respond(tip.nodes).counts
+    rows_of = rest, np.array(counts), np.array(force)
+    recorded = write_recording(tmp_path / "real.h5", rows_of=rows_of)
+    out = tmp_path / "mine.json"
+    command = ["units", "fit", str(tmp_path / "plate.sim"), "--out", str(out)]
+    command += ["--recording", str(recorded), "--held-rows", "1"]
+    done = CliRunner().invoke(fem_app, [*command, "--touches", "2"], env={"COLUMNS": "100"})
+    assert done.exit_code == 0, done.output
+    assert "fitted to the rest and 2 of 3 touches" in done.output
+    (member,) = read_population(out)
+    assert member.specimen.name == "mine"
+    assert member.found["touches"] == 2
+    twin = Population(SimulationStore.open(tmp_path / "plate.sim").fingertip(), [member.specimen])
+    left = np.abs(twin.rest_counts["mine"] - rest).mean()
+    assert left < 0.3 * np.abs(ElectrodeModel(geometry).respond(tip.nodes).counts - rest).mean()
+    assert "mine" in CliRunner().invoke(fem_app, ["units", "show", str(out)]).output
+    refused = CliRunner().invoke(fem_app, [*command, "--touches", "-1"])
+    assert isinstance(refused.exception, ConfigError)
