@@ -1,9 +1,10 @@
 """Write docs/results/twin/sensor-fit.md, .json and .png: a specimen fitted to one real sensor.
 
-``python docs/make_sensor_fit.py FOLDER STORES`` takes the folder of public data, and a folder
-for two stores of presses, by a plate and by a sphere, which it makes or completes first. For each finger of the force logs it fits
-specimens to the rest and to the first touches, as ``palpate fem units fit --recording`` does, and
-compares what they read with the later touches, beside ridge regressions learned on the same ones.
+``python docs/make_sensor_fit.py FOLDER STORES`` takes the folder of public data, and a folder for
+two stores of presses, by a plate and by a sphere, which it makes or completes first. For each
+finger of the force logs it fits specimens to the rest and to the first touches, as ``palpate fem
+units fit --recording`` does, and compares what they read with the later touches, beside ridge
+regressions learned on the same ones.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ EDGE_M = 0.8e-3
 PRESSES = {"plate": 256, "sphere_large": 96}
 """What the fingers are taken to have touched; and another guess, to see what it matters."""
 LEAN_DEG, SIDE_DEG, OBLIQUE_DEG = (-55.0, 20.0), (-45.0, 45.0), 35.0
-"""Of the indenter along the finger (negative = onto the tip) and across; of its way to its normal."""
+"""Of the indenter along the finger (negative = onto the tip) and across; of its way to its axis."""
 STEP_M, STEPS = 0.15e-3, 25
 MOST_N = 8.0
 PLATE, SPHERE = PRESSES

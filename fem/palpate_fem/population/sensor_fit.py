@@ -46,8 +46,8 @@ Floats = NDArray[np.float64]
 OnRound = Callable[[int, float], None]
 
 REST_SPREAD = 50.0
-"""Of counts at rest when they are all that is fitted: what fits leave of real ones
-(docs/results/twin/units.md)."""
+"""Deviation of counts at rest [counts], if that of touches is not smaller: what fits leave of real
+ones (docs/results/twin/units.md)."""
 KEPT, LEAST_PROBABILITY = 4, 0.02
 """Presses for each touch that a fit of the specimen uses: the most probable, and how probable."""
 
@@ -278,7 +278,8 @@ def _residuals(
         return response.counts, _by_scaled(model, specimen, counts_by_parameters(model, response))
 
     rest, rest_slope = answer(library.rest, 0.0)
-    values, slopes = [(rest - touches.rest) / spread], [rest_slope / spread]
+    at_rest = min(spread, REST_SPREAD)
+    values, slopes = [(rest - touches.rest) / at_rest], [rest_slope / at_rest]
     known: dict[tuple[int, float], tuple[Floats, Floats]] = {}
     for pair in pairs:
         parts = []
