@@ -384,25 +384,76 @@ PARAMETERS = """
 NOTES = ""
 
 
-def share_of(scores: Scores) -> str:
-    """One cell of a table."""
-    found = scores.summary()
+def cell(finger: dict[str, Any], count: int, method: str, what: str) -> str:
+    """What one method explains, of the numbers of one finger."""
+    found = finger["scores"][str(count)].get(f"{method}; {what}")
+    if found is None:
+        return "-"
     low, high = found["explained_5_95"]
     return (
         f"{found['explained']:.2f} ({low:.2f} to {high:.2f}) [{found['median_error_counts']:.0f}]"
     )
 
 
-def parameter_rows(fingers: list[Finger]) -> list[list[str]]:
-    """Fitted parameters by specimen."""
-    columns = [("nominal", SpecimenParameters())]
-    for finger in fingers:
-        columns.append((f"{finger.touches.name}, rest", finger.fits[0].specimen))
-        columns.append((f"{finger.touches.name}, touches", finger.fits[HEADLINE].specimen))
-    rows = [["", *(name for name, _ in columns)]]
-    for words, of in ELECTRICAL:
-        rows.append([words, *(f"{of(one):.3g}" for _, one in columns)])
-    return rows
+def page_of(content: dict[str, Any]) -> str:
+    """The page, of all numbers."""
+    plate = f"plate, {PRESSES[PLATE]} presses"
+    fingers = content[plate]["fingers"]
+    given = [f"given: {what}" for what in GIVEN]
+    rows = [
+        [name, method, *(cell(finger, HEADLINE, method, what) for what in GIVEN)]
+        for name, finger in fingers.items()
+        for method in METHODS
+    ]
+    curve = [
+        [name, method, *(cell(finger, count, method, GIVEN[1]) for count in TOUCHES)]
+        for name, finger in fingers.items()
+        for method in (METHODS[1], METHODS[4])
+    ]
+    guesses = [
+        [name, library]
+        + [cell(some["fingers"][name], HEADLINE, METHODS[4], what) for what in GIVEN]
+        for name in fingers
+        for library, some in content.items()
+    ]
+    columns = {"nominal": SpecimenParameters()}
+    left = ["counts at rest, left by the fit", "-"]
+    for name, finger in fingers.items():
+        for count, words in ((0, "rest"), (HEADLINE, "and touches")):
+            fit = finger["fits"][str(count)]
+            columns[f"{name}, {words}"] = SpecimenParameters.from_json(json.dumps(fit["specimen"]))
+            left.append(f"{fit['found']['rest_error_counts']:.0f}")
+    parameters = [
+        [words, *(f"{of(one):.3g}" for one in columns.values())] for words, of in ELECTRICAL
+    ]
+    head = HEAD.format(
+        counts=" and ".join(f"{one['touches']} of {name}" for name, one in fingers.items()),
+        headline=HEADLINE,
+        presses=PRESSES[PLATE],
+        lean_low=LEAN_DEG[0],
+        lean_high=LEAN_DEG[1],
+        side_low=SIDE_DEG[0],
+        side_high=SIDE_DEG[1],
+        oblique=OBLIQUE_DEG,
+        most=MOST_N,
+        edge=EDGE_M * 1e3,
+        fill=ExperimentSpec().fluid_volume_m3 * 1e6,
+    )
+    return "".join(
+        [
+            head,
+            markdown_table(["finger", "method", *given], rows, words=2),
+            CURVE,
+            markdown_table(
+                ["finger", "method", *(f"{n} touches" for n in TOUCHES)], curve, words=2
+            ),
+            GUESSES.format(headline=HEADLINE),
+            markdown_table(["finger", "library", *given], guesses, words=2),
+            PARAMETERS,
+            markdown_table(["", *columns], [*parameters, left]),
+            NOTES,
+        ]
+    )
 
 
 def as_json(fingers: list[Finger]) -> dict[str, Any]:
@@ -473,49 +524,7 @@ def main(folder: Path, stores: Path) -> None:
     content = {name: as_json(some) for name, some in every.items()}
     text = json.dumps(content, indent=1) + "\n"
     (OUT / "sensor-fit.json").write_text(text, encoding="utf-8")
-    rows = [
-        [finger.touches.name, method]
-        + [
-            share_of(finger.scores[HEADLINE][method, what])
-            if (method, what) in finger.scores[HEADLINE]
-            else "-"
-            for what in GIVEN
-        ]
-        for finger in fingers
-        for method in METHODS
-    ]
-    curve = [
-        [finger.touches.name, method]
-        + [share_of(finger.scores[count][method, GIVEN[1]]) for count in TOUCHES]
-        for finger in fingers
-        for method in (METHODS[1], METHODS[4])
-    ]
-    guesses = [
-        [finger.touches.name, name]
-        + [share_of(finger.scores[HEADLINE][METHODS[4], what]) for what in GIVEN]
-        for k in range(len(fingers))
-        for name, some in every.items()
-        for finger in [some[k]]
-    ]
-    parameters = parameter_rows(fingers)
-    counts = " and ".join(f"{len(finger.touches)} of {finger.touches.name}" for finger in fingers)
-    (OUT / "sensor-fit.md").write_text(
-        HEAD.format(
-            counts=counts, headline=HEADLINE, presses=library.presses, lean_low=LEAN_DEG[0],
-            lean_high=LEAN_DEG[1], side_low=SIDE_DEG[0], side_high=SIDE_DEG[1],
-            oblique=OBLIQUE_DEG, most=MOST_N, edge=EDGE_M * 1e3,
-            fill=ExperimentSpec().fluid_volume_m3 * 1e6,
-        )
-        + markdown_table(["finger", "method", *(f"given: {w}" for w in GIVEN)], rows, words=2)
-        + CURVE
-        + markdown_table(["finger", "method", *(f"{n} touches" for n in TOUCHES)], curve, words=2)
-        + GUESSES.format(headline=HEADLINE)
-        + markdown_table(["finger", "library", *(f"given: {w}" for w in GIVEN)], guesses, words=2)
-        + PARAMETERS
-        + markdown_table(parameters[0], parameters[1:])
-        + NOTES,
-        encoding="utf-8",
-    )  # fmt: skip
+    (OUT / "sensor-fit.md").write_text(page_of(content), encoding="utf-8")
 
 
 if __name__ == "__main__":
