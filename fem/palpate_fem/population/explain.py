@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 WARMTH_SD = 0.2
 """Of ln of the conductivity between rest and a touch: in three minutes the idle sensor of the force
-logs rose by up to 165 counts, which is 0.2."""
+logs rose by up to 160 counts, which is 0.2."""
 
 ANGLE_SD_RAD = math.radians(20.0)
 """Between the measured and the simulated force: friction differs, and the axes of the real force
