@@ -93,27 +93,23 @@ def _uniform(name: str, ends: tuple[float, float], low: float, high: float) -> P
     return ParameterPrior(name, sum(ends) / 2, (ends[1] - ends[0]) / math.sqrt(12), low, high)
 
 
-def _limits(name: str) -> tuple[float, float]:
-    return LIMITS[name]
-
-
 PRIORS = (
-    ParameterPrior("sigma_s_m", SIGMA_S_M, SIGMA_LOG_SD, *_limits("sigma_s_m"), log=True),
-    _uniform("series_ohm", SERIES_OHM, *_limits("series_ohm")),
-    _uniform("side_closing_m", SIDE_CLOSING_M, *_limits("side_closing_m")),
-    _uniform("clamp_closing", CLAMP_CLOSING, *_limits("clamp_closing")),
-    _uniform("core_x_m", CORE_FORWARD_M, *_limits("core_offset_m")),
-    ParameterPrior("core_y_m", 0.0, CORE_SIDEWAYS_SD_M, *_limits("core_offset_m")),
-    _uniform("core_z_m", CORE_UP_M, *_limits("core_offset_m")),
+    ParameterPrior("sigma_s_m", SIGMA_S_M, SIGMA_LOG_SD, *LIMITS["sigma_s_m"], log=True),
+    _uniform("series_ohm", SERIES_OHM, *LIMITS["series_ohm"]),
+    _uniform("side_closing_m", SIDE_CLOSING_M, *LIMITS["side_closing_m"]),
+    _uniform("clamp_closing", CLAMP_CLOSING, *LIMITS["clamp_closing"]),
+    _uniform("core_x_m", CORE_FORWARD_M, *LIMITS["core_offset_m"]),
+    ParameterPrior("core_y_m", 0.0, CORE_SIDEWAYS_SD_M, *LIMITS["core_offset_m"]),
+    _uniform("core_z_m", CORE_UP_M, *LIMITS["core_offset_m"]),
     # A film cannot be thicker between pressed asperities than between loose ones.
     ParameterPrior("asperity_m", 80e-6, LOG_SD["asperity_m"], 20e-6, 300e-6, log=True),
     ParameterPrior("floor_m", 5e-6, LOG_SD["floor_m"], 0.5e-6, 20e-6, log=True),
-    ParameterPrior("squeeze_pa", 30e3, LOG_SD["squeeze_pa"], *_limits("squeeze_pa"), log=True),
-    _uniform("squeeze_exponent", (0.5, 1.0), *_limits("squeeze_exponent")),
+    ParameterPrior("squeeze_pa", 30e3, LOG_SD["squeeze_pa"], *LIMITS["squeeze_pa"], log=True),
+    _uniform("squeeze_exponent", (0.5, 1.0), *LIMITS["squeeze_exponent"]),
 )
 """Of the fit: as wide as the specimens of ``palpate fem units draw``."""
 
-ASYMMETRY = ParameterPrior("asymmetry", 1.0, LOG_SD["asymmetry"], *_limits("asymmetry"), log=True)
+ASYMMETRY = ParameterPrior("asymmetry", 1.0, LOG_SD["asymmetry"], *LIMITS["asymmetry"], log=True)
 """Of each electrode's factor, 19 of them."""
 
 
@@ -235,10 +231,8 @@ def _fitted(
     spread: float,
 ) -> Floats:
     """The most probable parameters for touches at known presses, from some on."""
-    ends = [
-        (p.scaled(p.low or 1e-12) if p.log else p.scaled(p.low), p.scaled(p.high)) for p in PRIORS
-    ]
-    ends += [(ASYMMETRY.scaled(ASYMMETRY.low), ASYMMETRY.scaled(ASYMMETRY.high))] * SENSING
+    priors = [*PRIORS, *[ASYMMETRY] * SENSING]
+    ends = [(prior.scaled(prior.low), prior.scaled(prior.high)) for prior in priors]
     low, high = np.array(ends).T
     memory: dict[bytes, tuple[Floats, Floats]] = {}
 
