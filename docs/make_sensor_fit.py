@@ -337,9 +337,9 @@ def draw(path: Path, fingers: list[Finger]) -> None:
 HEAD = """# A specimen fitted to one real sensor
 
 Made by `python docs/make_sensor_fit.py ../shared/data runs/presses` (four minutes, and half an
-hour for the simulations the first time). The two fingers of the force logs are always touched, at 3 to 7 N; where, by what
-and under which angle was not recorded. A touch is a stretch of half a second in which no electrode
-moves by more than 100 counts: {counts}.
+hour for the simulations the first time). The two fingers of the force logs are always touched, at 3
+to 7 N; where, by what and under which angle was not recorded. A touch is a stretch of half a second
+in which no electrode moves by more than 100 counts: {counts}.
 Specimens are fitted to the counts at rest and to the first touches in order of time, as
 `palpate fem units fit plate.sim --recording FILE.h5 --touches {headline}` does, and judged by the
 second half of the touches.
