@@ -272,10 +272,8 @@ def test_where_fingertips_differ_some_are_never_met() -> None:
     force = np.tile([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], (2 * len(presses), 1))
     one = replace(
         population(),
-        **{
-            name: np.zeros((len(group), 19), kind)
-            for name, kind in (("electrodes", np.uint16), ("baseline", np.float32))
-        },
+        electrodes=np.zeros((len(group), 19), np.uint16),
+        baseline=np.zeros((len(group), 19), np.float32),
         force=force.astype(np.float32),
         group=group.astype(np.int32),
         block=group.astype(np.int32),
