@@ -288,6 +288,34 @@ def test_assembled_tangent_is_the_derivative_of_the_forces(
     assert difference(found, (forces[0] - forces[1]) / (2 * step)) < 1e-6
 
 
+def test_a_renewed_spread_follows_a_state_that_has_moved_on(squeeze: Squeeze, dense: Dense) -> None:
+    """The derivative is right again, of equations whose gaps' offsets stay as they were."""
+    pressed = squeeze("sphere_medium", 0.3, drag_m=1e-4, mortar=True)
+    system, state = pressed.system, pressed.state
+    system.correct_contact(state, pressed.press)
+    offset, stale = state.on_indenter.gap, state.on_indenter.spread
+    state.position += np.random.default_rng(6).normal(0.0, 3e-5, state.position.shape)
+    here, step = state.position.copy(), 1e-10
+    move = np.random.default_rng(5).normal(size=here.shape)
+    forces, found = [], []
+    for sign in (1.0, -1.0):
+        state.position = here + sign * step * move
+        pressed.settle()
+        forces.append(system.balance(state, pressed.press).unbalanced)
+    for renewed in (False, True):
+        state.position = here
+        pressed.settle()
+        system.balance(state, pressed.press)
+        if renewed:
+            system.renew_spread(state, pressed.press)
+        found.append(dense(system) @ move.ravel() + system.unsymmetric_product(move.ravel()))
+    wanted = (forces[0] - forces[1]) / (2 * step)
+    assert difference(found[0], wanted) > 1e-3
+    assert difference(found[1], wanted) < 1e-6
+    assert state.on_indenter.gap is offset
+    assert abs(state.on_indenter.spread - stale).max() > 0.0
+
+
 def test_sticking_to_a_flat_has_a_symmetric_tangent(squeeze: Squeeze) -> None:
     """So no iterations are spent on its rest."""
     pressed = squeeze("cube", 5.0, drag_m=1e-6)

@@ -1,8 +1,9 @@
 """Newton's method for one state: an iteration's linear system, and the step along its solution.
 
 The linear system is the sparse symmetric tangent, bordered by the fluid pressure, plus the
-unsymmetric share of friction, which corrects the solution of the symmetric part. When to do what is
-decided by ``iteration``.
+unsymmetric share of friction, which corrects the solution of the symmetric part. Where a symmetric
+part that is nearly singular would magnify what this leaves over, all of it is solved together. When
+to do what is decided by ``iteration``.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import contextlib
 from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator, gmres
+from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, gcrotmk, gmres
 
 from palpate.errors import SimulationError
 from palpate_fem.arrays import Floats
@@ -29,6 +31,17 @@ from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.sparse.blas import one_thread
 from palpate_fem.sparse.factor import SparseFactor
 
+WHOLE_BELOW = 1e-4
+"""Residual below which continuation solves all of a linear system together.
+
+Far away an unsymmetric share that belongs to an active set still to change is better left out."""
+
+WHOLE_ACCURACY = 1e-2
+"""Share of the right-hand side that a whole solution leaves over; it takes 4 to 10 products."""
+
+WHOLE_SEARCH, WHOLE_KEPT, WHOLE_ROUNDS = 40, 8, 2
+"""Directions of a round of GMRES, directions kept between rounds, and most rounds."""
+
 
 class NewtonSolver:
     """Solves increments of one system; keeps its factorised tangent between them."""
@@ -40,6 +53,8 @@ class NewtonSolver:
         # Border of the factorised tangent K: the volume gradient b there, and K^-1 b.
         self._border: tuple[Floats, Floats] | None = None
         self._has_elastic = False  # whether the tangent of skin and fluid was ever evaluated
+        # Upper triangle of the factorised tangent of continuation; None = of Newton's method.
+        self._continued: Floats | None = None
 
     @one_thread()
     def solve(
@@ -82,6 +97,8 @@ class NewtonSolver:
                     break
             try:
                 if isinstance(wanted, Factorise):
+                    if wanted.viscosity is not None and wanted.elastic:
+                        system.renew_spread(state, indenter)
                     answer = self._factorise(wanted)
                 else:
                     if isinstance(wanted, Correct):
@@ -102,7 +119,7 @@ class NewtonSolver:
 
     def forget(self) -> None:
         """Drop the last tangent, so that the next solution does not depend on earlier ones."""
-        self._border, self._has_elastic = None, False
+        self._border, self._has_elastic, self._continued = None, False, None
 
     def _factorise(self, wanted: Factorise) -> bool:
         """Factorise the present tangent; whether it has no unstable direction.
@@ -115,6 +132,7 @@ class NewtonSolver:
             elastic=wanted.elastic, viscosity=wanted.viscosity or 0.0
         )
         self._has_elastic = True
+        self._continued = None if wanted.viscosity is None else values
         if wanted.viscosity and wanted.can_rise:
             return self.factor.factorise_definite(values)
         self.factor.factorise(values)  # single precision may doubt a tangent that is definite
@@ -177,6 +195,10 @@ class NewtonSolver:
         system = self.system
         # The pressures are condensed, so their misfit loads the nodes.
         right = -(balance.unbalanced + system.misfit_force(state))
+        near = balance.residual < WHOLE_BELOW
+        if self._continued is not None and volume is not None and near:
+            right -= system.coupled_force()
+            return self._whole_solution(self._continued, right, balance, volume)
         if volume is None or self._border is not None:
             change = np.asarray(self.factor.solve(right))
         else:
@@ -193,6 +215,54 @@ class NewtonSolver:
         stiffness = float(gradient @ answer)
         pressure_change = (volume - balance.volume - float(gradient @ change)) / stiffness
         return change + pressure_change * answer, pressure_change
+
+    def _whole_solution(
+        self, values: Floats, right: Floats, balance: ForceBalance, volume: float
+    ) -> tuple[Floats, float]:
+        """Solve the bordered system with the unsymmetric share in it; see `_linear_solution`.
+
+        In a pinch the symmetric tangent may be nearly singular, or indefinite, where with its
+        unsymmetric share it is neither. One correction then leaves over a hundred times the
+        right-hand side. Here what is left over is that of the forces themselves.
+
+        Args:
+            values: Upper triangle of the factorised tangent.
+            right: Right-hand side of the forces (n,).
+            balance: At the state.
+            volume: Volume that the cavity has to take [m^3].
+        """
+        system, solve, count = self.system, self.factor.solve, len(right)
+        pattern = system.pattern
+        upper = sparse.csr_array((values, pattern.indices, pattern.indptr), shape=(count, count))
+        lower, diagonal = upper.T, upper.diagonal()
+        gradient = balance.volume_gradient.reshape(-1)[pattern.free].copy()
+        answer = np.asarray(solve(gradient))
+        stiffness = float(gradient @ answer)
+        # A missing volume counts as the forces of the pressure that it takes.
+        weight = float(np.linalg.norm(gradient)) / abs(stiffness)
+
+        def product(unknown: Floats) -> Floats:
+            x, pressure = unknown[:count], unknown[count]
+            force = upper @ x + lower @ x - diagonal * x + system.unsymmetric_product(x)
+            return np.append(force - pressure * gradient, weight * (gradient @ x))
+
+        def precondition(load: Floats) -> Floats:
+            x = np.asarray(solve(load[:count]))
+            pressure = (load[count] / weight - gradient @ x) / stiffness
+            return np.append(x + pressure * answer, pressure)
+
+        shape = (count + 1, count + 1)
+        solution, _ = gcrotmk(
+            LinearOperator(shape, matvec=product, dtype=np.float64),
+            np.append(right, weight * (volume - balance.volume)),
+            M=LinearOperator(shape, matvec=precondition, dtype=np.float64),
+            rtol=WHOLE_ACCURACY,
+            atol=0.0,
+            m=WHOLE_SEARCH,
+            k=WHOLE_KEPT,
+            maxiter=WHOLE_ROUNDS,
+        )
+        return np.asarray(solution[:count]), float(solution[count])
 
     def _with_unsymmetric_share(self, answer: Floats, coupled: Floats) -> Floats:
         """Correct a solution of the symmetric tangent for the unsymmetric share.

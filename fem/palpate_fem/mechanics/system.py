@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -206,6 +206,18 @@ class EquilibriumSystem:
         """Evaluate the mortar corrections of a state and keep them in it."""
         state.on_indenter = self.on_indenter.correction(state, indenter)
         state.on_core = self.on_core.correction(state)
+
+    def renew_spread(self, state: SolutionState, indenter: PosedIndenter | None) -> None:
+        """Let linear solutions tell how forces follow the pressures at the last `balance`.
+
+        The gaps' offsets and held directions stay: they belong to the equations, not to their
+        derivative.
+        """
+        renewed = self.on_indenter.correction(state, indenter).spread
+        state.on_indenter = replace(state.on_indenter, spread=renewed)
+        state.on_core = replace(state.on_core, spread=self.on_core.correction(state).spread)
+        self.outer.keep(state.on_indenter, state.indenter_pressure)
+        self.inner.keep(state.on_core, state.core_pressure)
 
     def tangent_values(self, *, elastic: bool = True, viscosity: float = 0.0) -> Floats:
         """Upper triangle of the symmetric tangent at the last `balance`.
