@@ -153,7 +153,7 @@ def campaign() -> str:
         cells += [f"{np.mean([run['iterations'] for run in mine]):.0f}"]
         rows.append(cells)
     others = [
-        f"* {run['name']}: {run['reason']}, {run['travel_mm']:.2f} mm along the path"
+        f"* {run['name']}: {run['reason'].split(', ')[0]}, {run['travel_mm']:.2f} mm along the path"
         for run in runs
         if run["outcome"] not in ("complete", "force limit")
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,13 +16,14 @@ from palpate_fem.mechanics.iteration import (
     FIRST_VISCOSITY,
     LEAST_VISCOSITY,
     MOST_VISCOSITY,
+    NewtonReport,
     NewtonSettings,
     PseudoTransient,
 )
 from palpate_fem.mechanics.load_stepping import SolverSettings, moves_in
 from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.solver import Fingertip
-from palpate_fem.mechanics.state import SolutionState
+from palpate_fem.mechanics.state import ForceBalance, SolutionState
 from palpate_fem.mechanics.system import EquilibriumSystem
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.result import IndentationOutcome
@@ -160,11 +162,48 @@ def test_a_snap_ends_the_trajectory_before_it(fill: Fill) -> None:
 
     run = finger.load_stepping(BALL, path)
     run.at.load, before = 2.0 * load, run.at.state.copy()
+    snap = f"the skin snaps: {2 * force:.1f} N fall to {force:.1f} N"
     report, _ = run.increment(path[1], 1.0)
     assert not report.converged
-    assert run.outcome is IndentationOutcome.DIVERGED
-    assert run.reason == f"the skin snaps: {2 * force:.1f} N fall to {force:.1f} N"
+    assert report.reason == snap
+    assert run.outcome is None  # a shorter increment may not snap
     np.testing.assert_array_equal(run.at.state.position, before.position)
+
+    run.settings = replace(run.settings, smallest_increment=1.0)
+    result = run.run()
+    assert result.outcome is IndentationOutcome.DIVERGED
+    assert result.reason == f"{snap}, 0.000 mm along the path"
+    assert not result.steps
+
+
+def test_where_a_shorter_increment_does_not_snap_the_trajectory_goes_on(fill: Fill) -> None:
+    finger = fill()
+    low = finger.nodes[:, 2].min()
+    path = np.array([[0.0, 0.0, low + depth, 1.0, 0.0, 0.0, 0.0] for depth in (-2e-6, 0.2e-3)])
+    run = finger.load_stepping(BALL, path)
+    assert run.increment(path[1], 1.0)[0].converged
+    pressed = run.at.load
+
+    run = finger.load_stepping(BALL, path)
+    increment, lengths = run.increment, []
+
+    def first_snaps(pose: Floats, length: float) -> tuple[NewtonReport, ForceBalance]:
+        lengths.append(length)
+        if len(lengths) > 1:
+            return increment(pose, length)
+        usual, untouched = finger.newton.settings, run.at.load
+        finger.newton.settings = NewtonSettings(iterations=1)  # only continuation converges
+        run.at.load = 2.0 * pressed
+        answer = increment(pose, length)
+        finger.newton.settings, run.at.load = usual, untouched
+        assert answer[0].reason.startswith("the skin snaps")
+        return answer
+
+    run.increment = first_snaps  # type: ignore[method-assign]
+    result = run.run()
+    assert lengths[:2] == [1.0, 0.5]
+    assert result.outcome is IndentationOutcome.COMPLETE
+    assert result.steps[-1].convergence.increments > 1
 
 
 @pytest.mark.parametrize(
@@ -191,7 +230,7 @@ def test_less_force_is_a_snap_on_the_way_in_only(
     there[:3] += move
     report, _ = run.increment(there, 1.0)
     assert report.converged is not inwards
-    assert run.reason.startswith("the skin snaps") is inwards
+    assert report.reason.startswith("the skin snaps") is inwards
 
 
 @pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0)])

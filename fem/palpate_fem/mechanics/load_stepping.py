@@ -36,8 +36,9 @@ SNAP = 0.1
 """Share of the force that may be lost where only pseudo-transient continuation converges.
 
 A larger loss, while the indenter moves into the skin, means that the solution has left its branch:
-nodes that carried the pinch have slipped out of it, which a continuous skin would not do. The
-indentation ends before the snap. On the way out or along the skin the force may fall."""
+nodes that carried the pinch have slipped out of it, which a continuous skin would not do. Shorter
+increments may stay on it, as continuation begins nearer to it; where the shortest one leaves it,
+too, the indentation ends before the snap. On the way out or along the skin the force may fall."""
 
 INWARD = 0.5
 """An indenter moves into the skin where its motion is within 60 degrees of its force on the skin.
@@ -270,8 +271,7 @@ class LoadStepping:
             force, last = _force(balance), float(np.linalg.norm(self.at.load.sum(axis=0)))
             fell = report.converged and force < (1.0 - SNAP) * last
             if fell and moves_in(start.position, self.at.load, self.at.indenter, indenter):
-                self.outcome = IndentationOutcome.DIVERGED
-                self.reason = f"the skin snaps: {last:.1f} N fall to {force:.1f} N"
+                report.reason = f"the skin snaps: {last:.1f} N fall to {force:.1f} N"
                 report.converged = False
         if report.converged and trial.fluid_pressure < -SUCTION_PA:
             self.outcome = IndentationOutcome.DIVERGED
