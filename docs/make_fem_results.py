@@ -182,10 +182,10 @@ penetration of any converged step {max(run["penetration_um"] for run in runs):.2
 
 
 CREASE = """
-Where `texture` does not complete, a node of the skin has come into the sharp crease between a grain
-and the plate (one case was looked at): in turn it belongs to the one or the other,
-whose normals are at right angles, so that no equilibrium is found. A node can touch one part of an
-indenter only. The other eight have no crease that skin reaches.
+These paths were run before continuation solved its linear systems as a whole, with tolerances of
+1e-8. Of the five that do not complete here four do since, and the first of `texture` ends at a snap
+([why](../adr/0013-skin-model-and-solver.md#what-kept-continuation-from-an-equilibrium)); they alone
+were run again.
 """
 
 

@@ -25,8 +25,8 @@ from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.path import PathSegment, parse_segments, show_segments
 from palpate_fem.mechanics.contact import PosedIndenter
-from palpate_fem.mechanics.iteration import NewtonReport, NewtonSettings
-from palpate_fem.mechanics.load_stepping import LoadStepping, SolverSettings
+from palpate_fem.mechanics.iteration import NewtonReport
+from palpate_fem.mechanics.load_stepping import LoadStepping
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
 from palpate_fem.mesh.parametric import biotac
@@ -217,10 +217,6 @@ AWAY_M, AWAY_STEPS = 1e-3, 3
 early: by half a millimetre on faces of 0.8 mm and an edge of R 0.2 mm. In steps, as one leaves
 something of the mortar correction's error where the skin rests on the core."""
 
-PATH_NEWTON = NewtonSettings(tolerance=1e-8, volume_tolerance=1e-8)
-"""What docs/results/fem.md was measured with; three of its paths leave as little with the default's
-tolerances, since gaps are found to 1 nm."""
-
 UNDONE_M = 1e-8
 """Accepted displacement of any node once the indenter has left [m]."""
 
@@ -318,8 +314,7 @@ def path_study(
         on_row: Called with each path that ended.
     """
     parameters = replace(FingertipParameters(), fluid_volume_m3=fluid_volume_m3)
-    settings = SolverSettings(newton=PATH_NEWTON)
-    tip = Fingertip.pressurised(biotac(edge_m=edge_m), parameters, settings)
+    tip = Fingertip.pressurised(biotac(edge_m=edge_m), parameters)
     rows = []
     for indenter, at_mm, words in random_paths(tip, count, seed):
         rows.append(run_path(tip, indenter, at_mm, words))

@@ -405,7 +405,7 @@ def test_settings_are_those_that_results_were_made_with() -> None:
         0.25e-3, 0.3, 0.15,
     )  # fmt: skip
     assert (iteration_module.FIRST_VISCOSITY, iteration_module.NO_VISCOSITY) == (1.0, 3e-3)
-    assert (iteration_module.LEAST_VISCOSITY, iteration_module.MOST_VISCOSITY) == (1e-3, 100.0)
+    assert (iteration_module.LEAST_VISCOSITY, iteration_module.MOST_VISCOSITY) == (1e-2, 100.0)
     assert (
         iteration_module.VISCOSITY_FALL,
         iteration_module.VISCOSITY_RISE,

@@ -25,7 +25,7 @@ HOPELESS = 0.3
 
 FIRST_VISCOSITY = 1.0
 VISCOSITY_FALL, VISCOSITY_RISE = 0.3, 3.0
-NO_VISCOSITY, LEAST_VISCOSITY, MOST_VISCOSITY = 3e-3, 1e-3, 100.0
+NO_VISCOSITY, LEAST_VISCOSITY, MOST_VISCOSITY = 3e-3, 1e-2, 100.0
 
 STALLED = 0.8
 """Residual over that two iterations before from which the iteration is taken to stall."""
