@@ -193,7 +193,7 @@ def test_where_a_shorter_increment_does_not_snap_the_trajectory_goes_on(fill: Fi
             return increment(pose, length)
         usual, untouched = finger.newton.settings, run.at.load
         finger.newton.settings = NewtonSettings(iterations=1)  # only continuation converges
-        run.at.load = 2.0 * pressed
+        run.at.load = 1.2 * pressed
         answer = increment(pose, length)
         finger.newton.settings, run.at.load = usual, untouched
         assert answer[0].reason.startswith("the skin snaps")
@@ -204,6 +204,24 @@ def test_where_a_shorter_increment_does_not_snap_the_trajectory_goes_on(fill: Fi
     assert lengths[:2] == [1.0, 0.5]
     assert result.outcome is IndentationOutcome.COMPLETE
     assert result.steps[-1].convergence.increments > 1
+
+
+def test_shorter_increments_together_lose_no_more_than_a_long_one_may(fill: Fill) -> None:
+    """Else a snap in pieces would pass, also where Newton's method converges."""
+    finger = fill()
+    low = finger.nodes[:, 2].min()
+    path = np.array([[0.0, 0.0, low + depth, 1.0, 0.0, 0.0, 0.0] for depth in (-2e-6, 0.2e-3)])
+    run = finger.load_stepping(BALL, path)
+    assert run.increment(path[1], 1.0)[0].converged
+    pressed = run.at.load
+
+    run = finger.load_stepping(BALL, path)
+    finger.newton.settings = NewtonSettings(iterations=1)  # only continuation converges
+    run.at.load = 2.0 * pressed
+    assert run.increment(path[1], 1.0)[0].reason.startswith("the skin snaps")
+    finger.newton.settings = NewtonSettings()
+    run.at.load = 1.05 * pressed  # the last loss alone would pass
+    assert run.increment(path[1], 0.5)[0].reason.startswith("the skin snaps")
 
 
 @pytest.mark.parametrize(

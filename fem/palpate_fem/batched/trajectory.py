@@ -82,11 +82,10 @@ Requests = Generator[Request, object, None]
 
 @dataclass(slots=True)
 class _Solved:
-    """An increment: how it went, the numbers of its last state, and whether the skin snapped."""
+    """An increment: how it went, and the numbers of its last state."""
 
     report: NewtonReport
     numbers: SlotNumbers
-    snapped: bool = False
 
 
 @dataclass(slots=True)
@@ -143,7 +142,7 @@ class BatchedTrajectory:
                     size *= 0.5
                     if size < self.settings.smallest_increment:
                         self.outcome = IndentationOutcome.DIVERGED
-                        self.unsolved = not solved.snapped
+                        self.unsolved = True
                         self.reason = (
                             f"{report.reason}, {self.travel_m * 1e3:.3f} mm along the path"
                         )
@@ -165,10 +164,11 @@ class BatchedTrajectory:
             solved.report.factorisations += first.factorisations
             fell = _force_n(solved) < (1.0 - SNAP) * self._force_n
             if solved.report.converged and fell and (yield MovesIn(pose)):
-                solved.report.reason = (
+                self.outcome = IndentationOutcome.DIVERGED
+                self.reason = (
                     f"the skin snaps: {self._force_n:.1f} N fall to {_force_n(solved):.1f} N"
                 )
-                solved.report.converged, solved.snapped = False, True
+                solved.report.converged = False
         report, pressure = solved.report, solved.numbers.fluid_pressure
         if report.converged and pressure < -SUCTION_PA:
             self.outcome = IndentationOutcome.DIVERGED

@@ -37,8 +37,9 @@ SNAP = 0.1
 
 A larger loss, while the indenter moves into the skin, means that the solution has left its branch:
 nodes that carried the pinch have slipped out of it, which a continuous skin would not do. Shorter
-increments may stay on it, as continuation begins nearer to it; where the shortest one leaves it,
-too, the indentation ends before the snap. On the way out or along the skin the force may fall."""
+increments may stay on it, as continuation begins nearer to it, but all of them together may lose no
+more; where the shortest one leaves it, too, the indentation ends before the snap. On the way out or
+along the skin the force may fall."""
 
 INWARD = 0.5
 """An indenter moves into the skin where its motion is within 60 degrees of its force on the skin.
@@ -185,6 +186,7 @@ class LoadStepping:
         self.outcome: IndentationOutcome | None = None
         self.reason = ""
         self.history = history
+        self._snapped_from_n = 0.0  # force before the last snap [N], while the indenter moves in
         newton.system.update_anchors(self.at.state, self.at.indenter)
         newton.forget()
         self._record(0, 1.0)
@@ -260,6 +262,7 @@ class LoadStepping:
         indenter = self.at.indenter.at(pose)
         trial = self._predicted(length)
         report, balance = self._solve(trial, indenter)
+        watched = self._snapped_from_n > 0.0
         if not report.converged and self.outcome is None:
             # The extrapolation may be wrong (e.g. at first touch), or the pinched skin has an
             # unstable direction: continue without the one and with a remedy for the other.
@@ -268,11 +271,17 @@ class LoadStepping:
             second.iterations += report.iterations
             second.factorisations += report.factorisations
             report = second
+            watched = True
+        if report.converged and watched:
             force, last = _force(balance), float(np.linalg.norm(self.at.load.sum(axis=0)))
-            fell = report.converged and force < (1.0 - SNAP) * last
-            if fell and moves_in(start.position, self.at.load, self.at.indenter, indenter):
+            last = max(last, self._snapped_from_n)
+            inwards = moves_in(start.position, self.at.load, self.at.indenter, indenter)
+            if inwards and force < (1.0 - SNAP) * last:
                 report.reason = f"the skin snaps: {last:.1f} N fall to {force:.1f} N"
                 report.converged = False
+                self._snapped_from_n = last
+            elif not inwards:
+                self._snapped_from_n = 0.0
         if report.converged and trial.fluid_pressure < -SUCTION_PA:
             self.outcome = IndentationOutcome.DIVERGED
             self.reason = (
