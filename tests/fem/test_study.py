@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from palpate_fem import study
+from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.path import parse_segments, show_segments
@@ -86,6 +87,17 @@ def test_friction_takes_what_the_indenter_gives_and_nothing_is_left(
     assert 1e-6 < row.friction_j
     assert row.friction_j == pytest.approx(row.work_j, rel=within)
     assert not tip.state.traction.any()  # the fingertip is as it was
+
+
+def test_nothing_is_left_of_a_given_fill_either() -> None:
+    """A fingertip that was filled to a volume rested 0.1 um from where each touch left it."""
+    filled = replace(FingertipParameters(), fluid_volume_m3=0.6e-6)
+    row = study.run_path(
+        Fingertip.pressurised(biotac(edge_m=0.8e-3), filled),
+        "sphere_large", (-6.0, 0.0), "press 0.5 mm, unload",
+    )  # fmt: skip
+    assert row.complete
+    assert row.undone_m < study.UNDONE_M
 
 
 def test_without_friction_none_is_taken(tip: Fingertip, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -124,6 +124,8 @@ class Fingertip:
         if parameters.fluid_volume_m3 is not None:
             self._check_suction(parameters.fluid_volume_m3)
             self._fill_to(parameters.fluid_volume_m3 + self.core_volume, STEPS_TO_PRESSURISE)
+            # Where it rests on the core the last step leaves it 0.1 um from where it comes back to.
+            self._fill_to(self.cavity_m3, 1)
             progress(1.0)
             return
         wanted = parameters.total_thickness_m
