@@ -53,9 +53,9 @@ SKINS = {
 HARD_N = 2.0
 CELLS = {
     "seen_specimen_seen_press": "learned from",
-    "seen_specimen_unseen_press": "specimen seen, press not",
-    "unseen_specimen_seen_press": "specimen not, press seen",
-    "unseen_specimen_unseen_press": "neither seen",
+    "seen_specimen_unseen_press": "press not met",
+    "unseen_specimen_seen_press": "specimen not met",
+    "unseen_specimen_unseen_press": "fingertip not met",
 }
 FIGURES = {
     "force_magnitude_n": "force [N]",
@@ -296,7 +296,9 @@ def page(found: dict[str, Any], networks: dict[str, list[dict[str, Any]]]) -> st
         NETWORK.format(
             **first["rows"],
             specimens=first["specimens"],
+            fingertips=first["fingertips"],
             presses=first["presses"],
+            sha=first["data_sha256"],
             unseen=unseen,
         )
     )
@@ -312,46 +314,38 @@ def page(found: dict[str, Any], networks: dict[str, list[dict[str, Any]]]) -> st
 HEAD = """# A population of simulated BioTacs
 
 Made by `python docs/make_population.py`, whose head names the commands before it. All of it is
-simulated: one skin and fill, indented by finite elements; specimens differ in their electrodes,
-fluid, core's place, noise and warmth ([priors](twin/units.md)).
+simulated: fingertips, each with a skin, fill and friction of its own, indented by finite elements;
+specimens on them, which differ in their electrodes, fluid, core's place, noise and warmth
+([priors](twin/units.md), `palpate_fem.population.fingertips`).
 
 ## The set
 """
 
 NETWORK = """## One network for all specimens
 
-`palpate train population` ({all:,} rows of {presses:,} presses, {train:,} of them learned from). It
-reads the change of the logarithm of each impedance since rest, and is told the specimen by its
-untouched electrodes and by presses of it, if some are known (FiLM). {unseen} of {specimens}
-specimens and a tenth of the presses are in no training. Rows of at least 0.5 N.
+`palpate train population` ({all:,} rows of {presses:,} presses, {train:,} of them learned from;
+content of the features file: sha256 {sha}). It reads the change of the logarithm of each impedance
+since rest, and is told the specimen by its untouched electrodes and by presses of it, if some are
+known (FiLM). Of {fingertips} fingertips three, with all their specimens and presses, are in no
+training (*fingertip not met*), of the others 15 % of the specimens (*specimen not met*, presses
+met) and a tenth of the presses (*press not met*): {unseen} of {specimens} specimens in all. Rows of
+at least 0.5 N.
 
-*Ratio*: of a specimen that was not met to one that was, both on presses that were not met (goal
-1.2). The last three columns are of the cell where neither was seen: the network when all electrodes
-are off by 0.05 of a logarithm, as a fluid that has warmed since the tare (the worse of both signs),
-and rivals on the same inputs.
+*Ratio*: of a fingertip that was not met to a press that was not (goal 1.2). The last three columns
+are of the fingertips that were not met: the network when all electrodes are off by 0.05 of a
+logarithm, as a fluid that has warmed since the tare (the worse of both signs), and rivals on the
+same inputs.
 """
 
-SHOTS = """The same where some presses of the specimen are known: {specimens} specimens that were
-not met, {draws} draws of presses of each, tested on presses at other points, none of them in the
+SHOTS = """Where some presses of the finger are known: {specimens} specimens of fingertips that were not
+met, {draws} draws of presses of each, tested on presses at other points, none of them in the
 training; the same {rows:,} rows for any number of presses. *One factor*: what the network estimates
 without a press, times the factor that fits the known presses.
 """
 
 TOLD = """## What it says
 
-* **Where a specimen was met, presses limit; where it was not, the specimen does.** More passes and
-  less noise in training take the error from 2 N on presses that were learned from to 12 %, on
-  others to 29 %, on other specimens to no less than 42 % ([LOG](../../training/LOG.md)). There,
-  forces are too small or too large by one factor (standard deviation of its logarithm 0.55 over the
-  fifteen), which goes with how high the core sits (rank correlation -0.8) and how thick the
-  unloaded film is (-0.7). Ten times as many specimens to learn from, with as many trials, do not
-  change it: what a specimen's films do under pressure is not in its electrodes at rest, and takes a
-  press.
-* **A common offset does no harm**: 0.05 of a logarithm on all electrodes changes no median by 3 %.
-* **Centre of pressure and contact normal** are what an unknown finger can be asked for: 0.5 mm and
-  2.2 degrees, of 5 mm and 24 degrees for a constant.
-* **On real fingers it does not help yet**: no way of using it is better than none on both fingers
-  of `palpate train transfer` (LOG).
+TOLD
 """
 
 
