@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from palpate.messages import (
     Tare,
 )
 from palpate_services.viewer.timeline import TruthMatcher
+from palpate_services.viewer.touch_errors import TOUCHED_N
 
 _KEPT = 500
 """Instants whose truth and estimate may wait for each other: five seconds at 100 Hz."""
@@ -54,17 +55,15 @@ class TouchMoment:
 
 @dataclass(frozen=True, slots=True)
 class TouchMedians:
-    """Median errors: of the vectors' lengths and per axis, [N] and [m]; median age [s]."""
+    """Median errors of touched frames, per axis, [N] and [m]; median age of all estimates [s]."""
 
-    force_n: float
-    location_m: float
     force_axes_n: Vector
     location_axes_m: Vector
     age_s: float
 
 
 class TouchComparison:
-    """Matches estimates with the truth of the same instant; keeps the errors in contact."""
+    """Matches estimates with the truth of the same instant; keeps the errors of touched frames."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -113,18 +112,16 @@ class TouchComparison:
             age_s=age_s,
         )
         self.newest = moment
-        if not touched:
+        if np.linalg.norm(moment.true_force) < TOUCHED_N:
             return
         self._force_errors.append(moment.force - moment.true_force)
         if moment.location is not None and moment.true_location is not None:
             self._location_errors.append(moment.location - moment.true_location)
 
     def medians(self) -> TouchMedians:
-        """TouchMedians over all frames in contact so far; NaN where there were none."""
+        """Of all frames so far that are touched with ``TOUCHED_N``; NaN where there were none."""
         force, location = _rows(self._force_errors), _rows(self._location_errors)
         return TouchMedians(
-            force_n=float(np.median(np.linalg.norm(force, axis=1))),
-            location_m=float(np.median(np.linalg.norm(location, axis=1))),
             force_axes_n=np.median(np.abs(force), axis=0),
             location_axes_m=np.median(np.abs(location), axis=0),
             age_s=float(np.median(self._ages_s)) if self._ages_s else float("nan"),
@@ -168,6 +165,10 @@ class FieldMedians:
     field_m: float
     syntheses: int
     counts: float
+
+    def as_json(self) -> dict[str, float | None]:
+        """The same as plain values; None for NaN, which JSON lacks."""
+        return {name: None if np.isnan(value) else value for name, value in asdict(self).items()}
 
 
 class FieldComparison:

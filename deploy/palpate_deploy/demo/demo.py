@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
 import time
@@ -14,18 +15,20 @@ from rich.table import Table
 
 from palpate import Client
 from palpate.errors import LinkError, PalpateError, StreamTimeout
+from palpate.files.atomic import written_whole
 from palpate_deploy.demo.comparison import (
     FieldComparison,
     FieldMedians,
     TouchComparison,
     TouchMoment,
 )
-from palpate_deploy.diagnose.records import viewer_command
+from palpate_deploy.diagnose.records import error_lines, viewer_command
 from palpate_deploy.station.host import private_profile
 from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.supervision import Supervisor
+from palpate_services.viewer.touch_errors import TOUCHED_N, read_touches
 
 _SENSOR = "finger"
 _REFRESH_S = 0.1
@@ -119,7 +122,7 @@ def _table(comparison: TouchComparison, fields: FieldMedians, left_s: float) -> 
     assert moment is not None
     table = Table(title="touch of the virtual finger", title_justify="left")
     table.add_column("")
-    for column in ("truth", "estimate", "error", "median error"):
+    for column in ("truth", "estimate", "error", f"median, >= {TOUCHED_N:g} N"):
         table.add_column(column, justify="right", min_width=9)
     medians = comparison.medians()
     for what, scale, truth, estimate, errors in (
@@ -165,16 +168,17 @@ def _line(moment: TouchMoment) -> str:
 def _report(
     console: Console, comparison: TouchComparison, fields: FieldMedians, records: list[Path]
 ) -> int:
-    """Draw the picture; print median errors and the paths of the files."""
+    """Print errors by force and the paths of the files; write the numbers and the picture."""
     if not comparison.count or not records:
         console.print("no estimate came; see the logs above and try: palpate doctor")
         return FAILED
     record = records[-1]
-    medians = comparison.medians()
+    errors = read_touches(record, sensor=_SENSOR).errors()
+    for line in error_lines(errors):
+        console.print(line, soft_wrap=True)
+    age_s = comparison.medians().age_s
     console.print(
-        f"{comparison.count:,} estimates; median error: force {medians.force_n:.3f} N, "
-        f"location {medians.location_m * 1e3:.2f} mm (in contact); "
-        f"median age at the client {medians.age_s * 1e3:.1f} ms",
+        f"{comparison.count:,} estimates; median age at the client {age_s * 1e3:.1f} ms",
         soft_wrap=True,
     )
     console.print(
@@ -184,11 +188,16 @@ def _report(
         soft_wrap=True,
     )
     print(f"record   {record}")
+    numbers = record.with_suffix(".json")
+    summary = {"touches": errors.as_json(), "age_median_s": age_s, "fields": fields.as_json()}
+    with written_whole(numbers) as partial:
+        partial.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    print(f"numbers  {numbers}")
     picture = record.with_suffix(".png")
     try:
         from palpate_services.viewer.plot import plot_record
 
-        plot_record(record, picture)
+        plot_record(record, picture, sensor=_SENSOR)
         print(f"picture  {picture}")
     except PalpateError as error:  # the record exists; a picture can be made later
         print(f"picture  none: {error}")

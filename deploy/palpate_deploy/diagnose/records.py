@@ -10,7 +10,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -22,6 +22,9 @@ from palpate.files.record import RecordSummary, check_readable, recover, summari
 from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import cell
 from palpate_deploy.station.status import duration_text
+
+if TYPE_CHECKING:  # palpate info and record do not need what draws
+    from palpate_services.viewer.touch_errors import RecordErrors
 
 
 def viewer_command(view: Path) -> str:
@@ -150,10 +153,45 @@ def review_path(
         if picture is not None:
             from palpate_services.viewer.plot import plot_record
 
-            for name, value in plot_record(path, picture).items():
-                print(f"  {name:24} {value:.4g}")
-            print(picture)
+            for line in error_lines(plot_record(path, picture, bundles=bundles)):
+                print(line)
+            print(printable(str(picture)))
         print(f"look at it: {viewer_command(written)}")
+
+
+def error_lines(errors: RecordErrors) -> list[str]:
+    """Errors by force as lines of text: those of touched frames first."""
+    touched = errors.touched
+    lines = [
+        f"touched (true force {touched.name}): {touched.frames:,} of {errors.estimates:,} "
+        f"estimates; median error: force {_with_unit(touched.force_median_n, 'N')}, "
+        f"location {_with_unit(touched.location_median_m, 'mm')}",
+        "  true force      frames   force error [N]        location error [mm]",
+        "                           median  90 % below     median  90 % below",
+    ]
+    for each in errors.bins:
+        cells = [
+            _digits(each.force_median_n, "N"),
+            _digits(each.force_p90_n, "N"),
+            _digits(each.location_median_m, "mm"),
+            _digits(each.location_p90_m, "mm"),
+        ]
+        lines.append(
+            f"  {each.name:14} {each.frames:7,}   {cells[0]:>6}  {cells[1]:>10}"
+            f"     {cells[2]:>6}  {cells[3]:>10}"
+        )
+    return lines
+
+
+def _with_unit(value: float | None, unit: str) -> str:
+    return "unknown" if value is None else f"{_digits(value, unit)} {unit}"
+
+
+def _digits(value: float | None, unit: str) -> str:
+    """A force [N] with three decimals, a length [m] in millimetres with two; ``-`` for None."""
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if unit == "N" else f"{1e3 * value:.2f}"
 
 
 def _review_store(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -20,9 +21,10 @@ SEQUENCE = "seq"
 
 AXES = ("x", "y", "z")
 AXIS_COLOURS = ((236, 98, 66), (74, 186, 118), (66, 146, 246))
-TRUTH_COLOUR = (236, 236, 240)
+TRUTH_COLOUR = (240, 90, 200)
+"""Not white: the legend of Rerun's light theme is."""
 ESTIMATE_COLOUR = (255, 196, 61)
-ERROR_COLOUR = (214, 120, 222)
+ERROR_COLOUR = (150, 176, 208)
 QUIET_COLOUR = (120, 144, 170)
 BACKGROUND = (24, 26, 31)
 
@@ -47,15 +49,27 @@ _POSITIONS = {
 }
 
 
-def record_layout(sensors: Mapping[str, SensorType], *, with_fields: Collection[str] = ()) -> Any:
-    """Layout of a record: a tab for each sensor, its fingertip left, its signals right.
+@dataclass(frozen=True, slots=True)
+class SensorContents:
+    """What there is to lay out of one sensor of a record.
 
-    The tabs of ``with_fields``, the sensors that have fields, get one more row.
+    Attributes:
+        kind: Its type.
+        tared: Whether there are tared counts.
+        fields: Whether there are fields or syntheses.
     """
+
+    kind: SensorType
+    tared: bool
+    fields: bool
+
+
+def record_layout(sensors: Mapping[str, SensorContents]) -> Any:
+    """Layout of a record: a tab for each sensor, what it looks like above, its curves below."""
     rrb = require("rerun.blueprint", extra="services")
     tabs = [
-        _sensor_tab(rrb, sensor, kind, fields=sensor in with_fields)
-        for sensor, kind in list(sensors.items())[:MAX_SENSORS]
+        _sensor_tab(rrb, sensor, contents)
+        for sensor, contents in list(sensors.items())[:MAX_SENSORS]
     ]
     return _screen(rrb, tabs, timeline=TIMELINE)
 
@@ -109,44 +123,43 @@ def _space(
     )
 
 
-def _sensor_tab(rrb: Any, sensor: str, kind: SensorType, *, fields: bool) -> Any:
+def _sensor_tab(rrb: Any, sensor: str, contents: SensorContents) -> Any:
     plot = partial(_curves, rrb, sensor)
 
     def body(origin: str, name: str) -> Any:
         # From the side of the pad, tip to the left, as one looks at one's own finger.
-        eye, target = (0.009, -0.020, -0.024), (-0.0055, 0.0, -0.003)
+        eye, target = (0.006, -0.0165, -0.0195), (-0.0055, 0.0, -0.003)
         return _space(rrb, f"{sensor}/{origin}", name, eye, target)
 
-    finger = body("finger", "Fingertip [m]: contact and force, estimate against truth")
-    signals = rrb.Vertical(
-        plot("electrodes", f"Electrodes E1-E{kind.layout.electrodes} [counts]"),
-        rrb.Horizontal(
-            plot("pdc", "PDC, static pressure [counts]"),
-            plot("pac", "PAC, vibration [counts]"),
-        ),
-        row_shares=[3, 2],
-    )
+    bodies = [body("finger", "Force (arrow) and contact: estimate yellow, truth pink")]
+    electrodes = f"Electrodes E1-E{contents.kind.layout.electrodes}"
+    # Raw counts are thousands, tared ones tens: in one plot nothing would be seen of a touch.
+    counts = plot("electrodes/raw", f"{electrodes}, raw [counts]")
+    if contents.tared:
+        tared = plot("electrodes/tared", f"{electrodes}, tared [counts]")
+        counts = rrb.Tabs(tared, counts, active_tab=0)
+    electrode_plots = [counts]
+    if contents.fields:
+        scale = f"grey 0 mm to yellow {1e3 * FIELD_FULL_M:g} mm"
+        bodies += [body(f"field/{of}", f"Skin, {of}: {scale}") for of in ("truth", "estimate")]
+        electrode_plots.append(plot("synthesised", "Electrodes, synthesised from a field [counts]"))
     forces = rrb.Vertical(
-        *(plot(f"force/{axis}", f"Force {axis} [N]", legend=True) for axis in AXES),
-        row_shares=[1, 1, 1],
+        *(plot(f"force/{axis}", f"Force {axis} [N]", legend=axis == AXES[0]) for axis in AXES)
     )
     errors = rrb.Vertical(
         plot("error/force", "Error of the force [N]"),
-        plot("error/location", "Error of the contact location [m]"),
+        plot("error/location_mm", "Error of the contact location [mm]"),
     )
-    rows = [
-        rrb.Horizontal(finger, signals, column_shares=[2, 3]),
+    pressures = rrb.Vertical(
+        plot("pdc", "PDC, static pressure [counts]"), plot("pac", "PAC, vibration [counts]")
+    )
+    return rrb.Vertical(
+        rrb.Horizontal(*bodies),
+        rrb.Horizontal(*electrode_plots, pressures, column_shares=[3] * len(electrode_plots) + [2]),
         rrb.Horizontal(forces, errors, column_shares=[3, 2]),
-    ]
-    if fields:
-        scale = f"grey 0 mm to yellow {1e3 * FIELD_FULL_M:g} mm"
-        skins = [body(f"field/{of}", f"Skin, {of}: {scale}") for of in ("truth", "estimate")]
-        compared = rrb.Vertical(
-            plot("electrodes/tared", "Electrodes, measured and tared [counts]"),
-            plot("synthesised", "Electrodes, synthesised from a field [counts]"),
-        )
-        rows.insert(1, rrb.Horizontal(*skins, compared, column_shares=[1, 1, 1]))
-    return rrb.Vertical(*rows, row_shares=[1] * len(rows), name=sensor)
+        row_shares=[4, 3, 4],
+        name=sensor,
+    )
 
 
 def _trajectory_tab(rrb: Any, trajectory: str, longest_m: float) -> Any:
@@ -198,12 +211,12 @@ def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[
     yield "synthesised", line(names, wheel, 1.2)
     yield "pdc", line("PDC", [QUIET_COLOUR], 1.5)
     yield "pac", line("PAC", [QUIET_COLOUR], 1.0)
-    for axis, colour in zip(AXES, AXIS_COLOURS, strict=True):
+    for axis in AXES:
         # The thin truth is drawn over the thick estimate: what sticks out is the error.
-        yield f"force/{axis}/truth", line(f"{axis} truth", [TRUTH_COLOUR], 1.0)
-        yield f"force/{axis}/estimate", line(f"{axis} estimate", [colour], 3.0)
-    for what in ("force", "location"):
-        yield f"error/{what}", line(f"{what} error", [ERROR_COLOUR], 1.2)
+        yield f"force/{axis}/truth", line(f"{axis} truth", [TRUTH_COLOUR], 1.5)
+        yield f"force/{axis}/estimate", line(f"{axis} estimate", [ESTIMATE_COLOUR], 4.0)
+    for what, name in (("force", "force error"), ("location_mm", "location error")):
+        yield f"error/{what}", line(name, [ERROR_COLOUR], 1.5)
     if kind is SensorType.BIOTAC:
         vertices, triangles, normals = core_mesh()
         core = rr.Mesh3D(
@@ -218,10 +231,16 @@ def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[
     elif again:
         yield "finger/core", rr.Mesh3D.cleared()
         yield "finger/skin", rr.LineStrips3D.cleared()
-    yield "finger/electrodes", rr.Points3D(_POSITIONS[kind], radii=[7.5e-4])
+    positions = _POSITIONS[kind]
+    yield "finger/electrodes", rr.Points3D(positions, radii=[7.5e-4])
+    # A text has the colour of its point. These are too small to be seen, and have the colours of
+    # the curves; those of the electrodes themselves change with their counts.
+    numbers = [name.removeprefix("E") for name in names]
+    texts = {"colors": wheel, "labels": numbers, "show_labels": True}
+    yield "finger/numbers", rr.Points3D(positions, radii=[1e-6], **texts)
     for name, colour, point_m, arrow_m in (
-        ("truth", TRUTH_COLOUR, 7e-4, 2.4e-4),
-        ("estimate", ESTIMATE_COLOUR, 9e-4, 3e-4),
+        ("truth", TRUTH_COLOUR, 5e-4, 2.2e-4),
+        ("estimate", ESTIMATE_COLOUR, 6.5e-4, 3e-4),
     ):
         contact = rr.Points3D.from_fields(colors=[colour], radii=[point_m])
         yield f"finger/contact/{name}", contact

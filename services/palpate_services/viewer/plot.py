@@ -1,137 +1,165 @@
-"""A record as a picture: truth against estimate, and how far they are apart."""
+"""A record as a picture: a touch, truth against estimate in time, and errors by force."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from palpate.bus.topics import TOPICS
-from palpate.errors import RecordingError
-from palpate.files.record import read_record
-from palpate.messages import FeatureEstimate, IndenterPoseFrame, WrenchFrame
 from palpate.process import require
-from palpate_services.viewer.timeline import MatchedMessages, TruthMatcher
+from palpate_services.inference.repository import MeshLibrary
+from palpate_services.viewer.timeline import MatchedMessages
+from palpate_services.viewer.touch_errors import TOUCHED_N, RecordErrors, read_touches
+from palpate_services.viewer.touch_picture import (
+    ESTIMATE,
+    INK,
+    MM_PER_M,
+    TRUTH,
+    ShownTouch,
+    draw_touch,
+    typical_touch,
+)
 
 Points = npt.NDArray[np.float64]
 
-_MATCHED = ("wrench", "pose", "features")
 _AXES = ("x", "y", "z")
-_COLOURS = ("#d1495b", "#2e8b57", "#2f6fb5")
-_INK = "#30343b"
-_MM_PER_M = 1e3  # the picture is in millimetres, everything else in SI units
 
 
-def plot_record(record: Path, picture: Path, *, sensor: str | None = None) -> dict[str, float]:
+def plot_record(
+    record: Path, picture: Path, *, sensor: str | None = None, bundles: Sequence[str] = ()
+) -> RecordErrors:
     """Draw truth against estimate of one sensor, by default that with the most estimates, as PNG.
 
-    Returns:
-        Summary: ``estimates`` and ``matched`` (how many), ``duration_s``, ``force_median_error_n``,
-        ``force_p90_error_n``, ``location_median_error_m``, ``location_p90_error_m``; an error is
-        absent where there is no truth to compare with.
+    Above, the touched frame with the median error: the skin where the record has its field and a
+    bundle its mesh (the packaged ones and ``bundles``), and the errors by force. Below, force and
+    contact location in time. Returns these errors.
 
     Raises:
+        ConfigError: One of ``bundles`` does not exist.
         RecordingError: The record is damaged or holds no estimates.
         MissingExtraError: matplotlib is not installed.
     """
-    whose, instants = _instants(record, sensor)
-    times = np.array(sorted(ns for ns, item in instants.items() if item.estimate is not None))
-    matched = [instants[ns] for ns in times.tolist()]
-    seconds = (times - times[0]) * 1e-9
-    force_errors = _errors(instant.force_error() for instant in matched)
-    location_errors = _errors(instant.location_error() for instant in matched)
-    summary = {
-        "estimates": float(len(matched)),
-        "matched": float(len(force_errors)),
-        "duration_s": float(seconds[-1]),
-    }
-    for name, unit, errors in (("force", "n", force_errors), ("location", "m", location_errors)):
-        if len(errors):
-            summary[f"{name}_median_error_{unit}"] = float(np.median(errors))
-            summary[f"{name}_p90_error_{unit}"] = float(np.percentile(errors, 90))
-    figure = _draw(seconds, matched, force_errors, location_errors)
-    figure.suptitle(
-        f"{whose}: estimate against truth, {len(matched)} estimates in {seconds[-1]:.1f} s",
-        fontsize=13,
-        color=_INK,
+    figures = require("matplotlib.figure", extra="services")
+    touches = read_touches(record, sensor=sensor)
+    errors = touches.errors()
+    touch = typical_touch(record, touches, MeshLibrary(bundles))
+    figure = figures.Figure(
+        figsize=(11, 8.6 if touch else 7.5), layout="constrained", facecolor="white"
     )
+    above, below = figure.subfigures(2, 1, height_ratios=[3.9, 4.7] if touch else [2.4, 5.1])
+    _draw_above(above, touch, errors)
+    seconds = (touches.times_ns - touches.times_ns[0]) * 1e-9
+    shown_s = None if touch is None else (touch.time_ns - int(touches.times_ns[0])) * 1e-9
+    _draw_curves(below, seconds, touches.matched, shown_s)
+    figure.suptitle(_headline(errors), fontsize=14, color=INK)
     picture.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(picture, dpi=110)
-    return summary
+    return errors
 
 
-def _instants(record: Path, sensor: str | None) -> tuple[str, dict[int, MatchedMessages]]:
-    matchers: dict[str, TruthMatcher] = {}
-    estimates: dict[str, int] = {}
-    for item in read_record(record):
-        topic, whose = item.address.topic, item.address.sensor
-        if topic not in _MATCHED or sensor not in (None, whose):
-            continue
-        message = TOPICS[topic].codec.decode(item.payload)
-        assert isinstance(message, FeatureEstimate | IndenterPoseFrame | WrenchFrame)
-        matchers.setdefault(whose, TruthMatcher(remember=None)).add(message)
-        if isinstance(message, FeatureEstimate):
-            estimates[whose] = estimates.get(whose, 0) + 1
-    if not estimates:
-        of_whom = "" if sensor is None else f" of the sensor {sensor!r}"
-        raise RecordingError(
-            f"{record} holds no estimates{of_whom}", remedy="record while the features service runs"
+def _draw_above(figure: Any, touch: ShownTouch | None, errors: RecordErrors) -> None:
+    if touch is None:
+        _error_table(figure.subplots(), errors)
+        return
+    grid = figure.add_gridspec(1, 3, width_ratios=[3.4, 3.4, 3.4])
+    panels = [figure.add_subplot(grid[0, at]) for at in range(2)]
+    draw_touch(figure, panels, touch)
+    table = figure.add_subplot(grid[0, 2])
+    _error_table(table, errors)
+    table.text(
+        0.0, -0.08,
+        "Left: the touched frame with the median force error.\n"
+        "Arrow: force, where it acts. Dot: contact location,\n"
+        "the tip of the indenter. Red: estimate. Black: truth.",
+        color=INK, fontsize=9.5, transform=table.transAxes,
+    )  # fmt: skip
+
+
+def _headline(errors: RecordErrors) -> str:
+    touched = errors.touched
+    if not touched.frames:
+        return f"{errors.sensor}: {errors.estimates:,} estimates, no truth of a touch recorded"
+    text = (
+        f"{errors.sensor}: touched (≥ {TOUCHED_N:g} N) in {touched.frames:,} of"
+        f" {errors.estimates:,} estimates; median error {_number(touched.force_median_n, 2)} N"
+    )
+    place = touched.location_median_m
+    return text if place is None else f"{text}, {MM_PER_M * place:.1f} mm"
+
+
+def _error_table(axes: Any, errors: RecordErrors) -> None:
+    """Median errors by true force, as text."""
+    axes.set_axis_off()
+    axes.set_title("median error, by true force", color=INK, fontsize=13)
+    columns = ((0.0, "left"), (0.52, "right"), (0.74, "right"), (1.04, "right"))
+    lines = [("", "frames", "force [N]", "location [mm]")]
+    for each in errors.bins:
+        place = each.location_median_m
+        name = each.name.replace(">=", "≥")
+        lines.append(
+            (
+                f"touched, {name}" if each is errors.touched else name,
+                f"{each.frames:,}",
+                _number(each.force_median_n, 2),
+                _number(None if place is None else MM_PER_M * place, 1),
+            )
         )
-    name = max(estimates, key=lambda key: estimates[key])
-    return name, dict(matchers[name].instants())
+    for row, line in enumerate(lines):
+        height = 0.92 - row * 0.125
+        for (across, side), text in zip(columns, line, strict=True):
+            axes.text(
+                across, height, text, ha=side, va="center", color=INK, fontsize=10.5,
+                weight="bold" if row == 1 else "normal", transform=axes.transAxes,
+            )  # fmt: skip
+    axes.plot([0, 1.04], [0.86, 0.86], color=INK, lw=0.8, transform=axes.transAxes, clip_on=False)
 
 
-def _errors(differences: Any) -> Points:
-    found = [float(np.linalg.norm(value)) for value in differences if value is not None]
-    return np.array(found, np.float64)
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _draw(seconds: Points, matched: list[MatchedMessages], force: Points, location: Points) -> Any:
-    figures = require("matplotlib.figure", extra="services")
-    figure = figures.Figure(figsize=(14, 9), layout="constrained", facecolor="white")
-    grid = figure.add_gridspec(4, 2)
+def _draw_curves(
+    figure: Any, seconds: Points, matched: Sequence[MatchedMessages], shown_s: float | None
+) -> None:
+    grid = figure.add_gridspec(3, 2)
     columns = (
         ("force {} [N]", _force_rows(matched)),
         ("contact {} [mm]", _location_rows(matched)),
     )
-    for column, (label, (truth, estimate)) in enumerate(columns):
+    for column, (name, (truth, estimate)) in enumerate(columns):
         first = None
         for row, axis in enumerate(_AXES):
             axes = figure.add_subplot(grid[row, column], sharex=first)
             first = first or axes
-            axes.plot(seconds, estimate[:, row], color=_COLOURS[row], lw=1.6, label="estimate")
-            axes.plot(seconds, truth[:, row], color=_INK, lw=0.9, label="truth")
-            axes.set_ylabel(label.format(axis), color=_INK)
+            # The thin truth is drawn over the thick estimate: what sticks out is the error.
+            axes.plot(seconds, estimate[:, row], color=ESTIMATE, lw=2.6, label="estimate")
+            axes.plot(seconds, truth[:, row], color=TRUTH, lw=1.1, label="truth")
+            if shown_s is not None:
+                axes.axvline(shown_s, color="#8a8f98", lw=1.0, ls="--", label="shown above")
+            axes.set_ylabel(name.format(axis), color=INK, fontsize=11)
             _tidy(axes)
             axes.tick_params(labelbottom=row == len(_AXES) - 1)
-            if row == 0:
-                axes.legend(
-                    loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False, ncols=2
-                )
-        axes.set_xlabel("time [s]", color=_INK)
-    _histogram(figure.add_subplot(grid[3, 0]), force, "force error", "N", "#6b4fa0")
-    location_mm = _MM_PER_M * location
-    _histogram(
-        figure.add_subplot(grid[3, 1]), location_mm, "contact location error", "mm", "#b5762f"
-    )
-    return figure
+        axes.set_xlabel("time [s]", color=INK, fontsize=11)
+    handles, names = axes.get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", fontsize=11, frameon=False, ncols=3)
 
 
-def _force_rows(matched: list[MatchedMessages]) -> tuple[Points, Points]:
+def _force_rows(matched: Sequence[MatchedMessages]) -> tuple[Points, Points]:
     truth = [_or_nan(item.wrench and item.wrench.force) for item in matched]
     estimate = [_or_nan(item.estimate and item.estimate.force) for item in matched]
     return np.stack(truth), np.stack(estimate)
 
 
-def _location_rows(matched: list[MatchedMessages]) -> tuple[Points, Points]:
+def _location_rows(matched: Sequence[MatchedMessages]) -> tuple[Points, Points]:
     truth = [
         _or_nan(item.pose.position if item.pose is not None and item.pose.in_contact else None)
         for item in matched
     ]
     estimate = [_or_nan(item.estimate and item.estimate.contact_location) for item in matched]
-    return _MM_PER_M * np.stack(truth), _MM_PER_M * np.stack(estimate)
+    return MM_PER_M * np.stack(truth), MM_PER_M * np.stack(estimate)
 
 
 def _or_nan(values: Any) -> Points:
@@ -139,30 +167,8 @@ def _or_nan(values: Any) -> Points:
     return np.full(3, np.nan) if values is None else np.asarray(values, np.float64)
 
 
-def _histogram(axes: Any, errors: Points, name: str, unit: str, colour: str) -> None:
-    axes.set_xlabel(f"{name} [{unit}]", color=_INK)
-    axes.set_ylabel("estimates", color=_INK)
-    _tidy(axes)
-    if not len(errors):
-        axes.text(0.5, 0.5, "no truth recorded", ha="center", transform=axes.transAxes, color=_INK)
-        return
-    # The longest tail would squeeze everything else into the first bars.
-    reach = float(np.percentile(errors, 99)) or 1.0
-    axes.hist(errors, bins=60, range=(0.0, reach), color=colour, alpha=0.85)
-    median = float(np.median(errors))
-    axes.axvline(median, color=_INK, lw=1.2)
-    axes.annotate(
-        f"median {median:.3g} {unit}, 90 % below {np.percentile(errors, 90):.3g} {unit}",
-        (0.98, 0.9),
-        xycoords="axes fraction",
-        ha="right",
-        fontsize=9,
-        color=_INK,
-    )
-
-
 def _tidy(axes: Any) -> None:
     axes.set_axisbelow(True)
     axes.grid(visible=True, color="#e4e4e8", lw=0.7)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(colors=_INK, labelsize=8)
+    axes.tick_params(colors=INK, labelsize=9)

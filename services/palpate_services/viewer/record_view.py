@@ -21,7 +21,7 @@ from palpate.bus.topics import TOPICS
 from palpate.errors import RecordingError
 from palpate.files.bundle import FieldMesh
 from palpate.files.record import read_record
-from palpate.messages import FloatArray, SensorType
+from palpate.messages import FloatArray
 from palpate.process import require
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.viewer.layout import (
@@ -29,6 +29,7 @@ from palpate_services.viewer.layout import (
     FIELD_FULL_M,
     SEQUENCE,
     TIMELINE,
+    SensorContents,
     electrode_shades,
     record_fixtures,
     record_layout,
@@ -46,7 +47,7 @@ BATCH_MESSAGES = 200
 ARROW_M_PER_N = 2e-3
 """Length of a force arrow [m/N]."""
 
-_CURVES = ("electrodes/raw", "electrodes/tared", "error/force", "error/location", "synthesised")
+_CURVES = ("electrodes/raw", "electrodes/tared", "error/force", "error/location_mm", "synthesised")
 
 Send = Callable[[str, list[Any], Iterable[Any]], None]
 
@@ -135,8 +136,7 @@ class RerunView:
         self.full = False
         self._max_bytes = max_bytes
         self._scenes: dict[str, SensorTimeline] = {}
-        self._drawn: dict[str, SensorType] = {}
-        self._with_fields: set[str] = set()
+        self._drawn: dict[str, SensorContents] = {}
         self._stream = self._rr.RecordingStream(APPLICATION)
         library = MeshLibrary() if meshes is None else meshes
         self._fields = FieldDrawer(self._rr, self._stream, library)
@@ -210,16 +210,14 @@ class RerunView:
             self._open = False
 
     def _prepare(self, sensors: list[str]) -> None:
-        kinds = {sensor: self._scenes[sensor].sensor_type for sensor in sensors}
-        new = [sensor for sensor in sensors if self._drawn.get(sensor) is not kinds[sensor]]
-        with_fields = {sensor for sensor in sensors if self._scenes[sensor].has_fields}
-        if not new and with_fields <= self._with_fields:
+        drawn = dict(self._drawn)
+        for sensor in sensors:
+            scene = self._scenes[sensor]
+            drawn[sensor] = SensorContents(scene.sensor_type, scene.has_tared, scene.has_fields)
+        before, self._drawn = self._drawn, drawn
+        if drawn == before:
             return
-        again = self._drawn.keys() & new
-        self._drawn.update(kinds)
-        self._with_fields |= with_fields
-        drawn = dict(sorted(self._drawn.items()))
-        layout = record_layout(drawn, with_fields=self._with_fields)
+        layout = record_layout(dict(sorted(drawn.items())))
         if self._open:
             self._stream.send_blueprint(layout)
         else:
@@ -227,9 +225,11 @@ class RerunView:
         if not self._open:
             self._stream.send_recording_name(self._title)
             self._open = True
-        for sensor in new:
-            for entity, value in record_fixtures(kinds[sensor], again=sensor in again):
-                self._stream.log(f"{sensor}/{entity}", value, static=True)
+        for sensor in sensors:
+            kind, known = drawn[sensor].kind, before.get(sensor)
+            if known is None or known.kind is not kind:
+                for entity, value in record_fixtures(kind, again=known is not None):
+                    self._stream.log(f"{sensor}/{entity}", value, static=True)
 
     def _draw(self, sensor: str, timeline: SensorTimeline) -> None:
         rr = self._rr

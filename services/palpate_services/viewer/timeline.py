@@ -87,6 +87,12 @@ REMEMBERED = 1024
 
 _NOWHERE = np.full(3, np.nan)
 
+_LEAST_N = 0.1
+"""A smaller force [N] is mostly noise, which would put its line anywhere."""
+
+_MM_PER_M = 1e3
+"""Rerun shows 0.0012 m as 0.00 on its axis; people read a fingertip in millimetres."""
+
 
 @dataclass(frozen=True, slots=True)
 class TimelineRow:
@@ -174,6 +180,7 @@ class SensorTimeline:
         self._thinners = {"truth": FieldThinner(), "estimate": FieldThinner()}
         self.pending = False
         self.has_fields = False
+        self.has_tared = False
         self.sensor_type = SensorType.BIOTAC
         """Type of the last frame; before the first one the most common type."""
 
@@ -214,7 +221,7 @@ class SensorTimeline:
         NaN where not valid. Of ``truth`` and ``estimate`` each: ``force/...`` [N], shape ``(3,)``;
         ``arrow/...``, the same at instants when it is known where it acts, or that nothing touches;
         ``location/...`` [m], shape ``(3,)`` or None; ``field/...``, each a ``FieldRow``.
-        ``error/force`` [N] and ``error/location`` [m]: magnitudes, shape ``(1,)``.
+        ``error/force`` [N] and ``error/location_mm`` [mm]: magnitudes, shape ``(1,)``.
         ``synthesised``: tared counts synthesised from a field, shape ``(19,)``.
         """
         rows, self._rows, self.pending = self._rows, defaultdict(list), False
@@ -227,6 +234,7 @@ class SensorTimeline:
             kind, counts = "raw", frame.electrodes.astype(np.float32)
         else:
             kind, counts = "tared", frame.electrodes - tare.electrodes
+            self.has_tared = True
         self._rows[f"electrodes/{kind}"].append(_row(frame.stamp, counts))
         pressure = np.concatenate([[frame.pdc], frame.pac]).astype(np.float32)
         layout = frame.sensor_type.layout
@@ -256,7 +264,7 @@ class SensorTimeline:
 
     def _add_true_arrow(self, instant: MatchedMessages) -> None:
         if instant.wrench is not None and instant.pose is not None:
-            at = instant.pose.position if instant.pose.in_contact else None
+            at = _acts_near(instant.wrench, instant.pose) if instant.pose.in_contact else None
             row = _row(instant.wrench.stamp, instant.wrench.force, at=at)
             self._rows["arrow/truth"].append(row)
 
@@ -264,11 +272,32 @@ class SensorTimeline:
         error = instant.location_error()
         if error is None and instant.estimate is not None and instant.pose is not None:
             error = _NOWHERE  # a gap in the line, not a line across the time without contact
-        self._add_error("location", stamp, error)
+        self._add_error("location_mm", stamp, None if error is None else _MM_PER_M * error)
 
     def _add_error(self, what: str, stamp: Stamp, error: Values | None) -> None:
         if error is not None:
             self._rows[f"error/{what}"].append(_row(stamp, np.array([np.linalg.norm(error)])))
+
+
+def line_of_action(wrench: WrenchFrame) -> tuple[Values, Values] | None:
+    """A point [m] and the direction of the line along which a wrench acts, each ``(3,)``.
+
+    None where it says no line: without a force, or without a torque (a sensor of forces only).
+    """
+    force, torque = wrench.force.astype(np.float64), np.asarray(wrench.torque, np.float64)
+    size = float(np.linalg.norm(force))
+    if size < _LEAST_N or not torque.any():
+        return None
+    return np.cross(force, torque) / size**2, force / size
+
+
+def _acts_near(wrench: WrenchFrame, pose: IndenterPoseFrame) -> Values:
+    """Where the true force acts [m], shape ``(3,)``: its line's point beside the indenter's tip."""
+    line = line_of_action(wrench)
+    if line is None:
+        return pose.position
+    through, along = line
+    return np.asarray(through + ((pose.position - through) @ along) * along)
 
 
 def _row(
