@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from palpate.files.record import summarise
 
@@ -22,14 +25,37 @@ def test_demo_ends_with_record_view_and_picture(
     result = palpate("demo", "--seconds", "5", "--out", out, timeout=120)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "truth" in result.stdout
-    assert "median error" in result.stdout
+    lines = result.stdout.splitlines()
+    headline = next(line for line in lines if line.startswith("touched (true force >= 0.5 N): "))
     found = re.search(r"([\d,]+) fields; .* ([\d,]+) syntheses", result.stdout)
     assert found is not None, result.stdout
     assert all(int(count.replace(",", "")) > 5 for count in found.groups())
     (record,) = out.glob("*.mcap")
     counts = {key.rpartition("/")[2]: n for key, n in summarise(record).counts.items()}
     assert counts["features"] > 100
-    for path in (record, record.with_suffix(".rrd"), record.with_suffix(".png")):
+    for path in (
+        record,
+        record.with_suffix(".rrd"),
+        record.with_suffix(".png"),
+        record.with_suffix(".json"),
+    ):
         assert path.stat().st_size > 0
         assert str(path) in result.stdout
     assert f"rerun {record.with_suffix('.rrd')}" in result.stdout
+    numbers = json.loads(record.with_suffix(".json").read_text())["touches"]
+    assert list(numbers["bins"]) == [
+        ">= 0.5 N", "0.5 to 1 N", "1 to 2 N", "2 to 8 N", ">= 8 N", "all frames"
+    ]  # fmt: skip
+    touched, everything = numbers["bins"][">= 0.5 N"], numbers["bins"]["all frames"]
+    assert 0 < touched["frames"] < everything["frames"] <= numbers["estimates"]
+    assert f"force {touched['force_median_n']:.3f} N" in headline
+    assert f"location {1e3 * touched['location_median_m']:.2f} mm" in headline
+    assert touched["force_median_n"] > everything["force_median_n"]
+    # A review of the record ends, with the same numbers and a picture that shows something.
+    again = tmp_path / "again.png"
+    reviewed = palpate("review", record, "--out", tmp_path / "again.rrd", "--png", again)
+    assert reviewed.returncode == 0, reviewed.stderr
+    assert headline in reviewed.stdout.splitlines()
+    pixels = imread(again)[..., :3]
+    assert pixels.mean() > 0.5
+    assert (np.ptp(pixels, axis=2) > 0.25).mean() > 0.05

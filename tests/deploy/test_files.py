@@ -52,6 +52,18 @@ def test_review_writes_a_view(palpate: Palpate, virtual_record: Path, tmp_path: 
     assert f"rerun {view}" in result.stdout
 
 
+def test_a_picture_of_a_record_without_estimates_is_refused(
+    palpate: Palpate, virtual_record: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("rerun", reason="palpate[services] is not installed")
+    result = palpate(
+        "review", virtual_record, "--out", tmp_path / "a.rrd", "--png", tmp_path / "a.png"
+    )
+    assert result.returncode == 3
+    assert "holds no estimates" in result.stderr
+    assert not (tmp_path / "a.png").exists()
+
+
 def test_virtual_record_is_the_same_again(tmp_path: Path, virtual_record: Path) -> None:
     again = tmp_path / "again.mcap"
     write_virtual_record(again, frames=300, seed=5)

@@ -169,8 +169,10 @@ def test_record_view_and_picture_of_a_session(
         assert verified.returncode == 0, verified.stderr.decode()
     summary = plot_record(record, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 20_000
-    assert summary["estimates"] == summary["matched"] == 300
-    assert summary["force_median_error_n"] > 0
+    assert summary.estimates == summary.all_frames.frames == 300
+    assert 0 < summary.touched.frames < 300
+    assert summary.touched.force_median_n is not None
+    assert summary.touched.force_median_n > 0
 
 
 def test_full_disk_is_reported_and_inference_does_not_notice(

@@ -70,10 +70,9 @@ def typical_touch(record: Path, touches: RecordedTouches, meshes: MeshLibrary) -
     found: list[tuple[float, int, MatchedMessages]] = []
     for time_ns, each in zip(touches.times_ns.tolist(), touches.matched, strict=True):
         error = each.force_error()
-        if time_ns not in touches.fields_ns or error is None or each.location_error() is None:
+        if time_ns not in touches.fields_ns or error is None or each.wrench is None:
             continue
-        assert each.wrench is not None
-        if np.linalg.norm(each.wrench.force) >= TOUCHED_N:
+        if np.linalg.norm(each.wrench.force) >= TOUCHED_N and _acts_at(each) is not None:
             found.append((float(np.linalg.norm(error)), time_ns, each))
     if not found:
         return None
@@ -127,19 +126,19 @@ def draw_touch(figure: Any, panels: list[Any], touch: ShownTouch) -> None:
     fields = {"truth": touch.truth, "estimate": touch.estimate}
     known = [np.linalg.norm(each, axis=1) for each in fields.values() if each is not None]
     top_m = max(float(each.max()) for each in known)
-    wrench, estimate = touch.matched.wrench, touch.matched.estimate
-    pose = touch.matched.pose
+    wrench, estimate, pose = touch.matched.wrench, touch.matched.estimate, touch.matched.pose
+    acts_at = _acts_at(touch.matched)
     assert wrench is not None
     assert estimate is not None
-    assert pose is not None
-    view = _view(np.array(_EYE) * (1.0, -1.0 if pose.position[1] > 0 else 1.0, 1.0))
+    assert acts_at is not None
+    view = _view(np.array(_EYE) * (1.0, -1.0 if acts_at[1] > 0 else 1.0, 1.0))
     longest_n = max(float(np.linalg.norm(each.force)) for each in (wrench, estimate))
     skin = touch.mesh.nodes + (touch.estimate if touch.truth is None else touch.truth)
-    acts_at = estimate.centre_of_pressure
-    acts_at = estimate.contact_location if acts_at is None else acts_at
-    true_end = where_it_acts(wrench, skin, touch.mesh.outer_faces)
-    true_end = pose.position if true_end is None else true_end
-    true_marks = (TRUTH, wrench.force, true_end, pose.position)
+    place = None if pose is None else pose.position
+    true_end: Any = where_it_acts(wrench, skin, touch.mesh.outer_faces)
+    if true_end is None:
+        true_end = acts_at if place is None else place
+    true_marks = (TRUTH, wrench.force, true_end, place)
     marks = (ESTIMATE, estimate.force, acts_at, estimate.contact_location)
     # The estimate is drawn over the truth, so that their distance shows.
     drawn: tuple[list[Any], list[Any]] = ([true_marks], [true_marks, marks])
@@ -150,7 +149,10 @@ def draw_touch(figure: Any, panels: list[Any], touch: ShownTouch) -> None:
             _paint_skin(axes, touch.mesh, field, top_m, view)
         for colour, force, end, place in shown:
             arrow_mm = _ARROW_MM * view(force) / (MM_PER_M * longest_n)
-            _paint_force(axes, view(end)[:2], arrow_mm[:2], view(place)[:2], colour)
+            _paint_force(axes, view(end)[:2], arrow_mm[:2], colour)
+            if place is not None:
+                across, up = view(place)[:2]
+                axes.plot(across, up, "o", ms=8, color=colour, mec="white", mew=1.4, zorder=12)
         size_n = np.linalg.norm((wrench if name == "truth" else estimate).force)
         axes.set_title(f"{name}: {size_n:.2f} N", color=INK, fontsize=13)
         axes.set(aspect="equal", anchor="N", xticks=[], yticks=[])
@@ -205,29 +207,33 @@ def where_it_acts(
     """Where a wrench's line of action meets a pressed skin [m], shape ``(3,)``.
 
     ``skin``: positions of its nodes [m], shape ``(V, 3)``, with the outer ``faces``. It is the
-    point of the line beside the node that is nearest to it, of those whose outside is pressed on.
-    None where the wrench says no line.
+    point of the line beside the node that is nearest to it, of the half that is pressed on. None
+    where the wrench says no line.
     """
     line = line_of_action(wrench)
     if line is None:
         return None
     through, along = line
-    positions = np.asarray(skin, np.float64)
-    pressed = np.unique(faces)
-    pressed = pressed[normals_of(positions, faces)[pressed] @ along < 0]
-    from_line = positions[pressed] - through
+    from_line = np.asarray(skin, np.float64)[np.unique(faces)] - through
     heights = from_line @ along
     away = np.linalg.norm(from_line - heights[:, None] * along, axis=1)
+    away[heights > heights.mean()] = np.inf  # where the line would come out again
     return np.asarray(through + heights[away.argmin()] * along)
 
 
-def _paint_force(axes: Any, end: Any, arrow_mm: Any, place: Any, colour: str) -> None:
-    """The force on the skin, ending where it acts, and the contact location as a dot."""
+def _acts_at(touch: MatchedMessages) -> FloatArray | None:
+    """Where the estimated force acts [m], or the next best; None where no place is estimated."""
+    if touch.estimate is None or touch.estimate.centre_of_pressure is not None:
+        return None if touch.estimate is None else touch.estimate.centre_of_pressure
+    return touch.estimate.contact_location
+
+
+def _paint_force(axes: Any, end: Any, arrow_mm: Any, colour: str) -> None:
+    """The force on the skin, ending where it acts."""
     arrow = {"arrowstyle": "-|>", "color": colour, "lw": 2.6, "mutation_scale": 18}
     props = {**arrow, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", end, end - arrow_mm, arrowprops=props, zorder=10)
     axes.update_datalim([end - arrow_mm])
-    axes.plot(*place, "o", ms=8, color=colour, mec="white", mew=1.4, zorder=12)
 
 
 def _scale_bar(axes: Any) -> None:
