@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from palpate.rigid import unit
 from palpate_fem.indenter.catalogue import BASE_M, indenter_names, make_indenter
@@ -94,7 +95,8 @@ def cut(axes: Axes, name: str) -> None:
 def main() -> None:
     """Nine views, and below each the section through its tip."""
     names = indenter_names()
-    figure = plt.figure(figsize=(13.5, 14.5), layout="constrained")
+    # Room below each section, so that the next name is not read as its own.
+    figure = plt.figure(figsize=(13.5, 14.5), layout=ConstrainedLayoutEngine(h_pad=0.12))
     rows = figure.subplots(6, 3, height_ratios=[2.6, 1] * 3)
     for index, name in enumerate(names):
         draw(rows[2 * (index // 3), index % 3], name)
@@ -104,8 +106,8 @@ def main() -> None:
     for row in rows[1::2]:
         row[0].set_ylabel("z [mm]")
     figure.suptitle(
-        "Indenters in their frame: tip at the origin, pressing along +z; "
-        "sections y = 0 with distances of 1, 2, 3 mm"
+        "Indenters in their frame: tip at the origin, pressing along +z;\n"
+        "below each its section y = 0, red: at distances of 1, 2 and 3 mm"
     )
     PICTURE.parent.mkdir(exist_ok=True)
     figure.savefig(PICTURE, dpi=90, metadata={"Software": None})

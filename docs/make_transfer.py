@@ -189,7 +189,9 @@ def draw(facts: dict[str, Any]) -> None:
         for number, colour in enumerate(("#1f5a94", "#b5541c")):
             results = [way["results"][number] for way in ways]
             name = results[0]["test"]
-            axis.plot(places, [one[key] for one in results], "o-", color=colour, label=name)
+            axis.plot(
+                places, [one[key] for one in results], "o-", color=colour, label=f"{name}, network"
+            )
             axis.plot(
                 places,
                 [one["ridge"][key] for one in results],

@@ -27,6 +27,7 @@ def test_demo_ends_with_record_view_and_picture(
     assert "truth" in result.stdout
     lines = result.stdout.splitlines()
     headline = next(line for line in lines if line.startswith("touched (true force >= 0.5 N): "))
+    assert "location error [mm]" in result.stdout
     found = re.search(r"([\d,]+) fields; .* ([\d,]+) syntheses", result.stdout)
     assert found is not None, result.stdout
     assert all(int(count.replace(",", "")) > 5 for count in found.groups())

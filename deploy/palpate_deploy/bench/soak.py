@@ -370,12 +370,17 @@ def draw(
     for name, history in sorted(histories.items()):
         minutes = [time_s / 60.0 for time_s in history.times_s]
         memory.plot(minutes, [use.rss_bytes / MEGABYTE for use in history.uses], lw=1, label=name)
-    memory.axvspan(0.0, result.warm_up_minutes, color="#eeeeee", zorder=0)
+    memory.axvspan(
+        0.0, result.warm_up_minutes, color="#eeeeee", zorder=0, label="warm-up, not counted"
+    )
     memory.set_ylabel("resident memory [MB]")
     memory.set_ylim(bottom=0)
     memory.legend(ncols=4, fontsize=9, frameon=False, loc="lower right")
     room.plot([at / 60.0 for at, _ in disk], [size / MEGABYTE for _, size in disk], lw=1)
-    room.axhline(result.disk_limit_mb, color="#d1495b", lw=1, ls="--")
+    room.axhline(result.disk_limit_mb, color="#d1495b", lw=1, ls="--", label="allowed")
+    room.legend(fontsize=9, frameon=False, loc="lower right")
     room.set_ylabel("records [MB]")
     room.set_xlabel("time [min]")
+    memory.set_title("memory of each process of a station")
+    room.set_title("records and views on the disk")
     figure.savefig(picture, dpi=110)

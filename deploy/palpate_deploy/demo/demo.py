@@ -175,7 +175,7 @@ def _report(
     record = records[-1]
     errors = read_touches(record, sensor=_SENSOR).errors()
     for line in error_lines(errors):
-        console.print(line, soft_wrap=True)
+        console.print(line, soft_wrap=True, markup=False)  # [mm] is a unit
     age_s = comparison.medians().age_s
     console.print(
         f"{comparison.count:,} estimates; median age at the client {age_s * 1e3:.1f} ms",

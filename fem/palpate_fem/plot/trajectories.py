@@ -111,6 +111,7 @@ def plot_overview(
         grid(axes)
     for axes in panels[len(names) :]:
         axes.set_axis_off()
+    bottom.suptitle("force in each trajectory; colour: how it ended", color=INK, fontsize=10)
     complete = outcomes[IndentationOutcome.COMPLETE]
     figure.suptitle(
         f"{title}\n{len(summaries)} trajectories, {complete} complete "
@@ -136,7 +137,12 @@ def _draw_range(axes: Any, names: list[str], groups: dict[str, list[TrajectorySu
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlim(left=0.0)
-    label(axes, "largest |F| of a trajectory [N]", "", "force: range, median, each trajectory")
+    label(
+        axes,
+        "largest |F| of a trajectory [N]",
+        "",
+        "force: bar range, stroke median, dots trajectories",
+    )
     axes.grid(visible=True, axis="x", color="#e4e4e8", lw=0.7)
 
 
@@ -169,6 +175,8 @@ def _draw_seconds(axes: Any, summaries: Sequence[TrajectorySummary]) -> None:
         return
     axes.hist(seconds, bins=30, color="#7aa6c2")
     axes.set_title(
-        f"median {np.median(seconds):.1f} s, longest {seconds.max():.1f} s", color=INK, fontsize=10
+        f"cost: median {np.median(seconds):.1f} s, longest {seconds.max():.1f} s",
+        color=INK,
+        fontsize=10,
     )
     grid(axes)

@@ -217,11 +217,14 @@ def plot_study(rows: Sequence[StudyRow], path: Path) -> None:
         force.plot(across, [100 * abs(row.force_change) for row in mine], **style)
         moved.plot(across, [MM * row.displacement_change_m for row in mine], **style)
         cost.plot(across, [row.seconds for row in mine], **style)
-    force.axhline(100 * FORCE_CHANGE, color=LIMIT, ls="--", lw=1)
-    moved.axhline(MM * DISPLACEMENT_CHANGE_M, color=LIMIT, ls="--", lw=1)
-    label(force, "", "change of the force [%]", "force, against the coarser one")
-    label(moved, "", "mean change [mm]", "displacement of the outer skin")
-    label(cost, "", "seconds a press", "cost")
+    limit = {"color": LIMIT, "ls": "--", "lw": 1, "label": "accepted below"}
+    force.axhline(100 * FORCE_CHANGE, **limit)
+    moved.axhline(MM * DISPLACEMENT_CHANGE_M, **limit)
+    across_name = "edge on the pad, unknowns, factorisation" if meshes else "steps of a press"
+    coarser = "coarser mesh" if meshes else "fewer steps"
+    label(force, across_name, "change of the force [%]", f"force, against the {coarser}")
+    label(moved, across_name, "mean change [mm]", f"outer skin, against the {coarser}")
+    label(cost, across_name, "computing time of a press [s]", "cost")
     first = [row for row in rows if row.press == rows[0].press]
     for axes in (force, moved, cost):
         grid(axes)

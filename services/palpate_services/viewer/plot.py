@@ -94,7 +94,7 @@ def _error_table(axes: Any, errors: RecordErrors) -> None:
     """Median errors by true force, as text."""
     axes.set_axis_off()
     axes.set_title("median error, by true force", color=INK, fontsize=13)
-    columns = ((0.0, "left"), (0.52, "right"), (0.74, "right"), (1.04, "right"))
+    columns = ((0.0, "left"), (0.54, "right"), (0.74, "right"), (1.06, "right"))
     lines = [("", "frames", "force [N]", "location [mm]")]
     for each in errors.bins:
         place = each.location_median_m
@@ -111,10 +111,10 @@ def _error_table(axes: Any, errors: RecordErrors) -> None:
         height = 0.92 - row * 0.125
         for (across, side), text in zip(columns, line, strict=True):
             axes.text(
-                across, height, text, ha=side, va="center", color=INK, fontsize=10.5,
+                across, height, text, ha=side, va="center", color=INK, fontsize=10,
                 weight="bold" if row == 1 else "normal", transform=axes.transAxes,
             )  # fmt: skip
-    axes.plot([0, 1.04], [0.86, 0.86], color=INK, lw=0.8, transform=axes.transAxes, clip_on=False)
+    axes.plot([0, 1.06], [0.86, 0.86], color=INK, lw=0.8, transform=axes.transAxes, clip_on=False)
 
 
 def _number(value: float | None, digits: int) -> str:

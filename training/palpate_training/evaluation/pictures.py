@@ -136,8 +136,9 @@ def draw_forces(folder: Path, force_n: Floats) -> Picture:
     figure = new_figure(7.0, 3.2)
     axes = figure.subplots()
     axes.hist(force_n, bins=60, color=unit_colour(0), alpha=0.8)
-    for bound in (2.0, 8.0):
-        axes.axvline(bound, color=INK, lw=0.8, ls="--")
+    for bound, name in ((2.0, "2 and 8 N"), (8.0, None)):
+        axes.axvline(bound, color=INK, lw=0.8, ls="--", label=name)
+    axes.legend(frameon=False, fontsize=8)
     label(axes, "magnitude of the force [N]", "rows")
     grid(axes, "y")
     of = force_shares(force_n)
@@ -255,7 +256,12 @@ def _draw_press(
             )  # fmt: skip
         label(axes, "travel past first contact [mm]", f"$F_{'xyz'[axis]}$ ({name}) [N]")
         grid(axes)
-    panels[0].legend(frameon=False, fontsize=8, labelcolor=INK)
+    # Above the panels: within one it would cover the curves of some press.
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(
+        handles, names, loc="outside upper right", ncols=len(names), frameon=False, fontsize=8,
+        labelcolor=INK,
+    )  # fmt: skip
     trajectory = data.trajectories[int(data.row_trajectory[rows[0]])]
     return finish(
         figure,

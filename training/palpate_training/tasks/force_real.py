@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
+from palpate.process import require
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
 from palpate_training.figures.style import new_figure, save
 from palpate_training.learning import baselines
@@ -261,26 +262,29 @@ def draw_force(path: Path, panels: Sequence[ForcePanel]) -> None:
         part.suptitle(panel.title, x=0.01, ha="left", fontsize=11)
         row = part.subplots(1, 4)
         truth, estimate = _with_norm(panel.truth), _with_norm(panel.estimate)
+        shared = require("matplotlib.colors", extra="training").LogNorm()  # set by the first
         for i, (axis, name) in enumerate(zip(row, ("Fx", "Fy", "Fz", "|F|"), strict=True)):
             values = np.concatenate([truth[:, i], estimate[:, i]])
             low, high = float(values.min()), float(values.max())
             margin = 0.04 * (high - low)
             limits = (low - margin, high + margin)
-            axis.hist2d(
+            *_, drawn = axis.hist2d(
                 truth[:, i],
                 estimate[:, i],
                 bins=_BINS,
                 range=(limits, limits),
-                norm="log",
+                norm=shared,
                 cmap="viridis_r",
                 cmin=1,
             )
-            axis.plot(limits, limits, "-", lw=0.8, color="#444444")
+            axis.plot(limits, limits, "-", lw=0.8, color="#444444", label="equal")
             axis.set(xlim=limits, ylim=limits, aspect="equal")
             axis.set_xlabel(f"true {name} [N]")
             axis.set_ylabel(f"estimated {name} [N]")
             axis.locator_params(nbins=5, integer=True)
             axis.spines[["top", "right"]].set_visible(False)
+        row[0].legend(frameon=False, fontsize=8, loc="upper left")
+        part.colorbar(drawn, ax=row, label="frames", shrink=0.85)
     save(figure, path)
 
 
