@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from palpate.messages import SensorType
+from palpate.messages import ElectrodeFrame, SensorType, Tare
 
 pytest.importorskip("rerun", reason="palpate[services] is not installed")
 
@@ -74,6 +76,28 @@ def test_every_plot_names_its_unit() -> None:
         assert views[f"finger/{entity}"].name.endswith(unit), entity
     spaces = views.keys() - {f"finger/{entity}" for entity in units}
     assert spaces == {"finger/finger", "finger/field/truth", "finger/field/estimate"}
+
+
+def test_a_running_view_is_laid_out_anew_when_the_finger_is_tared(
+    make_frame: Callable[..., ElectrodeFrame],
+    make_tare: Callable[..., Tare],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from palpate_services.viewer import record_view
+
+    asked: list[SensorContents] = []
+
+    def layout(sensors: dict[str, SensorContents]) -> Any:
+        asked.append(sensors["finger"])
+        return record_layout(sensors)
+
+    monkeypatch.setattr(record_view, "record_layout", layout)
+    with record_view.RerunView(tmp_path / "view.rrd", title="view") as view:
+        for message in (make_frame(1), make_frame(2), make_tare(), make_frame(3), make_frame(4)):
+            view.add("finger", message)
+            view.flush()
+    assert [contents.tared for contents in asked] == [False, True]
 
 
 @pytest.mark.parametrize("kind", list(SensorType))
