@@ -99,6 +99,8 @@ def _with_fields(
                 before = message
             elif after is None:
                 after = message
+        if estimate is not None and after is not None:
+            break  # the rest of a long record is later
     mesh = None if estimate is None else meshes.find(estimate.mesh_sha256)
     if estimate is None or mesh is None or estimate.displacement.shape != mesh.nodes.shape:
         return None
