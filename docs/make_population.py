@@ -204,17 +204,18 @@ def draw_set(found: dict[str, Any], path: Path) -> None:
 
 
 def draw_network(report: dict[str, Any], path: Path) -> None:
-    """Errors on presses that were not seen, beside those of ridge and constant."""
-    figure = new_figure(11.0, 3.0)
+    """Errors on presses that were not met, beside those of ridge and constant."""
+    figure = new_figure(11.0, 3.2)
     shown = [key for key in FIGURES if key != "force_angle_rad"]
-    cells = list(CELLS)[1::2]
+    met, never = (report["cells"][cell] for cell in list(CELLS)[1::2])
+    shots = never["shots"]
+    known = [key for key in shots if key.isdigit()]
     for k, (axes, key) in enumerate(zip(figure.subplots(1, len(shown)), shown, strict=True)):
-        seen, unseen = (report["cells"][cell] for cell in cells)
         bars = [
-            ("seen", seen["network"][key], unit_colour(0)),
-            ("unseen", unseen["network"][key], unit_colour(1)),
-            ("ridge", unseen["ridge"][key], "0.7"),
-            ("constant", unseen["constant"][key], "0.85"),
+            ("finger met", met["network"][key], unit_colour(0)),
+            *((f"{n} known", shots[n]["network"][key], unit_colour(1)) for n in known),
+            ("ridge", never["ridge"][key], "0.7"),
+            ("constant", never["constant"][key], "0.85"),
         ]
         axes.bar([name for name, _, _ in bars], [value for _, value, _ in bars],
                  color=[colour for _, _, colour in bars])  # fmt: skip
@@ -222,10 +223,11 @@ def draw_network(report: dict[str, Any], path: Path) -> None:
         label(axes, "", "median error" if k == 0 else "", FIGURES[key])
         grid(axes, "y")
     told = (
-        "On presses that were not seen: of a specimen that was, and of one that was not; ridge and "
-        f"constant on the latter. {report['name']}."
+        "Presses that were not met, of specimens that were (finger met) and of fingertips that "
+        "were not, of which so many other presses are known; ridge and constant on the latter. "
+        f"{report['name']}."
     )
-    finish(figure, path, "One network for all specimens", told)
+    finish(figure, path, "One network for all fingers", told)
 
 
 def cells_table(reports: list[dict[str, Any]]) -> str:
@@ -337,8 +339,8 @@ logarithm, as a fluid that has warmed since the tare (the worse of both signs), 
 same inputs.
 """
 
-SHOTS = """Where some presses of the finger are known: {specimens} specimens of fingertips that were not
-met, {draws} draws of presses of each, tested on presses at other points, none of them in the
+SHOTS = """Where some presses of the finger are known: {specimens} specimens of fingertips that were
+not met, {draws} draws of presses of each, tested on presses at other points, none of them in the
 training; the same {rows:,} rows for any number of presses. *One factor*: what the network estimates
 without a press, times the factor that fits the known presses.
 """
