@@ -32,6 +32,9 @@ DRIVERS: dict[str, str] = {
     "wrench_rdt": "palpate_gateway.wrench.rdt:WrenchRdt",
     "wrench_robotous": "palpate_gateway.wrench.robotous:WrenchRobotous",
     "wrench_bota": "palpate_gateway.wrench.bota:WrenchBota",
+    "ros_biotac": "palpate_gateway.ros.biotac:RosBiotac",
+    "ros_wrench": "palpate_gateway.ros.wrench:RosWrench",
+    "ros_bag": "palpate_gateway.ros.bag:RosBag",
 }
 """Built-in drivers, ``module:Class``."""
 

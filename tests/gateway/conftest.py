@@ -250,3 +250,11 @@ def bus(link: LinkConfig) -> Iterator[Bus]:
     """A router of our own on a free port, and a session."""
     with Session.open(link) as session:
         yield Bus(link, session)
+
+
+@pytest.fixture
+def ros_bag() -> Callable[..., Path]:
+    """Makes a bag of ROS: path, number of frames, dialect."""
+    from tests.gateway.ros_fakes import make_bag
+
+    return make_bag

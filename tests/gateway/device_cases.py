@@ -82,6 +82,26 @@ def _pose(emulator: Any) -> Options:
     return {"robot": emulator.robot, "connect": emulator.address, **_BENCH}
 
 
+def _ros_hand(kind: str) -> Case:
+    message = {"all": "sr_robot_msgs/BiotacAll", "hand": "biotac_sensors/BioTacHand"}[kind]
+    topic: Options = {"topic": "/hand/tactile", "message": message}
+    return Case(
+        f"ros_biotac-{kind}",
+        "ros_biotac",
+        lambda: _class("ros:RosHandEmulator")(whole_frames=kind == "hand"),
+        # An untouched finger of constant counts repeats its readings.
+        lambda emulator: {**topic, "connect": emulator.address, "repeats": "keep"},
+        nowhere={**topic, "connect": "tcp/127.0.0.1:9", "timeout_s": 0.2},
+        names="127.0.0.1:9",
+        gone="absent",
+        packages=("rosbags",),
+    )
+
+
+def _ros_bag(make: Any, folder: Path) -> Options:
+    return {"path": make("ros_bag")(folder / "run.bag", 120), "wrench_topic": "/ft"}
+
+
 def _pose_table(make: Any, folder: Path) -> Options:
     path = folder / "poses.csv"
     rows = ["time_s,x_m,y_m,z_m,qw,qx,qy,qz"]
@@ -228,6 +248,28 @@ CASES: tuple[Case, ...] = (
         "wrench_bota", "wrench_bota",
         lambda: _class("bota:BotaEmulator")(ramp, boot_s=0.05), "port",
         rate_hz=800, boot_s=0.5,
+    ),
+    _ros_hand("all"),
+    _ros_hand("hand"),
+    Case(
+        "ros_wrench",
+        "ros_wrench",
+        lambda: _class("ros:RosWrenchEmulator")(ramp),
+        lambda emulator: {"topic": "/ft/wrench", "connect": emulator.address, "rate_hz": 500},
+        nowhere={"topic": "/ft/wrench", "connect": "tcp/127.0.0.1:9", "timeout_s": 0.2},
+        names="127.0.0.1:9",
+        gone="",
+        packages=("rosbags",),
+    ),
+    Case(
+        "ros_bag",
+        "ros_bag",
+        file=_ros_bag,
+        nowhere={"path": "no/such/run.bag"},
+        names="no/such/run.bag",
+        frames=120,
+        samples=1,
+        packages=("rosbags",),
     ),
     Case(
         "pose_zenoh",

@@ -8,6 +8,7 @@ imports it.
 from __future__ import annotations
 
 _WORDS = "absent error_word parity saturated stuck"
+_ROS = "clock_drift cut late lost repeated restart silence stuck unplug wrong_time"
 _ROBOTOUS = "clock_drift cut junk lost overload repeated restart silence stuck unplug"
 
 FAULTS: dict[str, frozenset[str]] = {
@@ -28,6 +29,8 @@ FAULTS: dict[str, frozenset[str]] = {
         "biotac-pic32": "absent clock_drift cut end high_bits junk lost repeated restart saturated "
         "silence stuck unplug",
         "robot": "clock_drift late long lost nan repeated restart silence stuck unplug wrong_time",
+        "ros-hand": f"{_ROS} absent saturated",
+        "ros-wrench": f"{_ROS} nan",
     }.items()
 }
 """Faults that each emulated device can have; its class says what each of them does."""

@@ -6,6 +6,7 @@ sensor streams drop rather than block; a query is always answered; plain TCP, ne
 
 from palpate.bus.claims import SensorClaims
 from palpate.bus.delivery import Delivery
+from palpate.bus.foreign import ForeignPublisher, ForeignSample, ForeignSubscriber, ForeignToken
 from palpate.bus.link import Session
 from palpate.bus.presence import AliveService, CallerToken, Presence
 from palpate.bus.pubsub import Publisher, ReceivedMessage, Subscriber
@@ -21,6 +22,10 @@ __all__ = [
     "CallerToken",
     "Cancellation",
     "Delivery",
+    "ForeignPublisher",
+    "ForeignSample",
+    "ForeignSubscriber",
+    "ForeignToken",
     "Presence",
     "Publisher",
     "QueryAnswer",

@@ -19,6 +19,7 @@ from palpate.bus.attachments import OnTimings
 from palpate.bus.claims import ClaimWatch, SensorClaims
 from palpate.bus.delivery import Delivery
 from palpate.bus.endpoints import STATUS, Endpoint
+from palpate.bus.foreign import ForeignPublisher, ForeignSubscriber, ForeignToken
 from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
 from palpate.bus.pubsub import Publisher, ReceivedMessage, Subscriber
 from palpate.bus.query import ask, ask_again, first_reply, no_reply, raise_errors
@@ -290,6 +291,28 @@ class Session(Closing):
         """Receive several topics undecoded, in order of arrival."""
         keys = [self._key(topic, sensor, "*", "*", station) for topic in topics]
         return self._keep(Tap(self._raw, keys, delivery=delivery, capacity=capacity))
+
+    @property
+    def zid(self) -> str:
+        """Zenoh's id of this session."""
+        return str(self._raw.zid())
+
+    def foreign_subscriber(self, key: str, *, capacity: int = 4096) -> ForeignSubscriber:
+        """Receive raw samples under a key expression that is not palpate's."""
+        return self._keep(ForeignSubscriber(self._raw, key, capacity=capacity))
+
+    def foreign_publisher(self, key: str) -> ForeignPublisher:
+        """Publish bytes under a key that is not palpate's."""
+        return self._keep(ForeignPublisher(self._raw, key))
+
+    def foreign_token(self, key: str) -> ForeignToken:
+        """Declare a liveliness token that is not palpate's."""
+        return self._keep(ForeignToken(self._raw, key))
+
+    def foreign_tokens(self, key: str, *, timeout_s: float = 1.0) -> list[str]:
+        """Keys of the liveliness tokens that match a key expression that is not palpate's."""
+        replies = self._raw.liveliness().get(key, timeout=timeout_s)
+        return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
     def queryable(
         self,

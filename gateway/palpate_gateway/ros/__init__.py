@@ -1,0 +1,1 @@
+"""Sensors behind ROS: live topics over rmw_zenoh, and bags."""

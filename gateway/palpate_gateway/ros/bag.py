@@ -1,0 +1,251 @@
+"""A bag of ROS 1 or ROS 2 as a finite device: one finger, and the wrench on it."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from palpate.errors import ConfigError, RecordingError, WireError
+from palpate.messages import SensorType
+from palpate.process import require
+from palpate.ros.layouts import BIOTAC_ALL, BIOTAC_HAND, MD5, WRENCH_STAMPED, Dialect, typestore
+from palpate.ros.rmw_zenoh import check_topic_name
+from palpate_gateway.device import DeviceIdentity, FileDevice
+from palpate_gateway.protocols.ros_hands import RosFinger, RosHand, decode_hand
+from palpate_gateway.readings import ElectrodeReading, WrenchReading
+from palpate_gateway.ros.biotac import RosFingerOptions
+from palpate_gateway.ros.wrench import decode_wrench
+from palpate_gateway.wrench.device import Mount, MountOptions
+
+_TACTILE = (BIOTAC_ALL, BIOTAC_HAND)
+
+
+class RosBagOptions(RosFingerOptions):
+    """Options of the ``ros_bag`` driver.
+
+    Attributes:
+        path: ``NAME.bag`` of ROS 1, or the folder of a bag of ROS 2.
+        topic: Topic of the tactile messages; empty = the only one.
+        wrench_topic: Topic of the force/torque sensor (``WrenchStamped``); empty = none.
+        mount: How the force/torque sensor is mounted.
+        wrench_serial: Its serial number to publish; empty = its topic.
+    """
+
+    path: Path
+    topic: str = ""
+    wrench_topic: str = ""
+    mount: MountOptions = MountOptions()
+    wrench_serial: str = Field(default="", max_length=64, pattern=r"^[ -~]*$")
+
+    @field_validator("topic", "wrench_topic")
+    @classmethod
+    def _is_topic(cls, value: str) -> str:
+        return check_topic_name(value) if value else value
+
+
+class BagMessage(NamedTuple):
+    """An undecoded message of a bag: its bytes, and when it was recorded [ns since the epoch]."""
+
+    payload: bytes
+    recorded_ns: int
+
+
+class RosBagFile:
+    """A bag, read as often as needed.
+
+    Raises:
+        RecordingError: It is no bag, or it is damaged.
+        MissingExtraError: ``rosbags`` is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._library: Any = require("rosbags.highlevel", extra="gateway")
+        with self._opened() as reader:
+            self.dialect: Dialect = "cdr" if reader.is2 else "ros1"
+            self.start_ns = int(reader.start_time) if reader.message_count else 0
+            """When its first message was recorded [ns since the epoch]."""
+            self.topics = {one.topic: str(one.msgtype) for one in reader.connections}
+            """Layout of each topic."""
+            self._sums = {one.topic: str(one.digest) for one in reader.connections}
+
+    def _opened(self) -> Any:
+        if not self.path.exists():
+            raise RecordingError(f"{self.path} does not exist", remedy="correct the path")
+        try:
+            reader = self._library.AnyReader([self.path], default_typestore=typestore("cdr"))
+            reader.open()
+        except Exception as error:
+            raise RecordingError(
+                f"{self.path} is no bag of ROS: {error}",
+                remedy="name a NAME.bag, or the folder with metadata.yaml; `rosbag reindex` "
+                "repairs one whose recorder was killed",
+            ) from error
+        return _Closed(reader)
+
+    def choose(self, topic: str, layouts: tuple[str, ...]) -> str:
+        """The topic, checked; or if it is empty, the only one of these layouts.
+
+        Raises:
+            ConfigError: There is none, or several, or its messages are of another kind.
+            RecordingError: Its messages are of another version.
+        """
+        fitting = [name for name, layout in self.topics.items() if layout in layouts]
+        listed = ", ".join(f"{name} ({layout})" for name, layout in sorted(self.topics.items()))
+        if topic and topic not in fitting:
+            raise ConfigError(
+                f"{self.path}: {topic} holds no {' or '.join(layouts)}",
+                remedy=f"it holds: {listed or 'nothing'}",
+            )
+        if not topic and len(fitting) != 1:
+            raise ConfigError(
+                f"{self.path}: {len(fitting)} topics hold {' or '.join(layouts)}",
+                remedy=f"name one; it holds: {listed or 'nothing'}",
+            )
+        topic = topic or fitting[0]
+        layout, told = self.topics[topic], self._sums[topic]
+        if self.dialect == "ros1" and told not in ("*", "", MD5[layout]):
+            raise RecordingError(
+                f"{self.path}: {topic} has a {layout} of another version (MD5 {told})",
+                remedy=f"palpate reads the version with MD5 {MD5[layout]}; convert the bag",
+            )
+        return topic
+
+    def messages(self, topic: str) -> Iterator[BagMessage]:
+        """Messages of a topic in the order of recording.
+
+        Raises:
+            RecordingError: The bag is damaged.
+        """
+        with self._opened() as reader:
+            chosen = [one for one in reader.connections if one.topic == topic]
+            try:
+                for _, recorded_ns, payload in reader.messages(connections=chosen):
+                    yield BagMessage(bytes(payload), int(recorded_ns))
+            except Exception as error:
+                raise RecordingError(
+                    f"{self.path}: {topic} is damaged: {error}",
+                    remedy="use what came before, or repair the bag with the tools of ROS",
+                ) from error
+
+
+class _Closed:
+    """Closes an open reader, whatever its own ``with`` would open again."""
+
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+
+    def __enter__(self) -> Any:
+        return self._reader
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._reader.close()
+
+
+class RosBag(FileDevice):
+    """One finger of a bag, and the wrench on it if there is one, in the order of their times."""
+
+    options_class = RosBagOptions
+    needs = ("rosbags",)
+
+    def __init__(self, options: RosBagOptions) -> None:
+        model = f"finger {options.finger} of bag {options.path.name}"
+        super().__init__("ros_bag", SensorType.BIOTAC, model, options.rate_hz)
+        self._options = options
+        self._mount = Mount(options.mount)
+        self._track = options.track("")
+        self._counts = {"wrenches": 0, "not_finite": 0, "rejected_messages": 0}
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Readings, messages that are none, and what could not be decoded."""
+        return {**self._track.counters, **self._counts}
+
+    def _open(self) -> DeviceIdentity:
+        options = self._options
+        bag = RosBagFile(options.path)
+        topic = bag.choose(options.topic, _TACTILE)
+        wrench = bag.choose(options.wrench_topic, (WRENCH_STAMPED,)) if options.wrench_topic else ""
+        self._track = options.track(bag.topics[topic])
+        self._track.begin(bag.start_ns)
+        self._counts = dict.fromkeys(self._counts, 0)
+        first, finger = self._first(bag, topic)
+        self._counts["rejected_messages"] = 0
+        streams: list[Iterator[ElectrodeReading | WrenchReading]] = [self._fingers(bag, topic)]
+        if wrench:
+            streams.append(self._wrenches(bag, wrench))
+        self._deliver(heapq.merge(*streams, key=lambda reading: reading.time_s))
+        kind = finger.sensor_type
+        period_s = first.slot_period_s
+        if not first.whole_frames:
+            period_s = 1.0 / (options.rate_hz * kind.layout.slots)
+        serial = options.serial or finger.serial or f"{options.path.stem}-{options.finger}"
+        return DeviceIdentity(serial, period_s, start_wall_ns=bag.start_ns, sensor_type=kind)
+
+    def _first(self, bag: RosBagFile, topic: str) -> tuple[RosHand, RosFinger]:
+        """The first message with the finger."""
+        places: set[int] = set()
+        for hand in self._hands(bag, topic):
+            finger = self._track.find(hand)
+            if finger is not None:
+                return hand, finger
+            places |= {k for k, one in enumerate(hand.fingers, 1) if one is not None}
+        raise RecordingError(
+            f"{bag.path}: {topic} has no readings of {self.info.model}",
+            remedy=f"it has fingers {sorted(places) or 'none'}; correct finger or serial",
+        )
+
+    def _hands(self, bag: RosBagFile, topic: str) -> Iterator[RosHand]:
+        layout = bag.topics[topic]
+        for payload, recorded_ns in bag.messages(topic):
+            try:
+                hand = decode_hand(payload, layout, bag.dialect)
+            except WireError:
+                self._counts["rejected_messages"] += 1
+                continue
+            yield hand if hand.time_ns else replace(hand, time_ns=recorded_ns, end_ns=recorded_ns)
+
+    def _fingers(self, bag: RosBagFile, topic: str) -> Iterator[ElectrodeReading]:
+        before: int | None = None
+        for hand in self._hands(bag, topic):
+            # The header of ROS 1 has a number; drivers that do not fill it leave it at 0.
+            now, lost = hand.sequence, None
+            if before is not None and now is not None and now > before:
+                lost = now - before - 1
+            before = now
+            reading = self._track.take(hand, lost=lost)
+            if reading is not None:
+                yield reading
+
+    def _wrenches(self, bag: RosBagFile, topic: str) -> Iterator[WrenchReading]:
+        serial = self._options.wrench_serial or topic.strip("/").replace("/", "-")
+        last_ns = -1
+        for payload, recorded_ns in bag.messages(topic):
+            try:
+                message = decode_wrench(payload, bag.dialect)
+            except WireError:
+                self._counts["rejected_messages"] += 1
+                continue
+            time_ns = message.time_ns or recorded_ns
+            values = np.array(message.values)
+            if not np.isfinite(values).all():
+                self._counts["not_finite"] += 1
+                continue
+            if time_ns <= last_ns:
+                continue
+            last_ns = time_ns
+            force, torque = self._mount.on_biotac(values)
+            self._counts["wrenches"] += 1
+            yield WrenchReading(
+                tick=self._counts["wrenches"],
+                time_s=(time_ns - bag.start_ns) * 1e-9,
+                force=force,
+                torque=torque,
+                serial=serial,
+            )
