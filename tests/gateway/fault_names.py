@@ -17,7 +17,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "crc": ("crc_errors", "failed_checks"),
     "cut": (
         "cobs_errors", "lost_packets", "misaligned", "malformed_lines", "bad_lengths",
-        "failed_checks", "lonely_first",
+        "failed_checks", "lonely_first", "rejected_parse",
     ),
     "end": ("end_records",),
     "error": ("invalid_samples",),
@@ -25,10 +25,12 @@ NAMES: dict[str, tuple[str, ...]] = {
     "foreign": ("bad_commands",),
     "high_bits": ("misaligned",),
     "junk": ("junk_bytes", "wrong_lengths"),
-    "late": ("late_records", "status_app_took_too_long", "late_poses", *_SILENCE),
+    "late": ("late_records", "status_app_took_too_long", "late_poses", "old_numbers", *_SILENCE),
     "long": ("rejected_quaternion",),
     "latched": ("status_monitor_condition_latched",),
-    "lost": ("lost_slots", "lost_frames", "lost_packets", "lost_samples", *_SILENCE),
+    "lost": (
+        "lost_slots", "lost_frames", "lost_packets", "lost_samples", "lost_messages", *_SILENCE,
+    ),
     "nan": ("bad_numbers", "not_finite", "rejected_non_finite"),
     "overload": ("overloads",),
     "overrun": ("bridge_overruns",),
@@ -36,7 +38,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "raw": ("status_raw",),
     "repeated": (
         "duplicate_slots", "late", "repeated_packets", "repeated_samples", "repeated_records",
-        "repeated_poses",
+        "repeated_poses", "old_numbers",
     ),
     "restart": _GONE,
     "saturated": ("saturated_samples", "channels_saturated"),
@@ -45,7 +47,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "stopped": ("streams_restarted",),
     "stuck": ("channels_stuck",),
     "unplug": _GONE,
-    "wrong_time": ("wrong_times",),
+    "wrong_time": ("wrong_times", "late_messages"),
 }  # fmt: skip
 """Counters, or classes of errors, of which at least one must show a fault."""
 
@@ -70,6 +72,11 @@ COUNTERS: dict[tuple[str, str], str] = {
     ("pose_zenoh", "late"): "late_poses",
     ("pose_zenoh", "lost"): "lost_poses",
     ("pose_zenoh", "repeated"): "repeated_poses",
+    ("ros_*", "cut"): "rejected_parse",
+    ("ros_*", "late"): "old_numbers",
+    ("ros_*", "lost"): "lost_messages",
+    ("ros_*", "repeated"): "old_numbers",
+    ("ros_wrench", "nan"): "not_finite",
     ("wrench_bota", "crc"): "failed_checks lost_samples",
     ("wrench_bota", "cut"): "junk_bytes lost_samples",
     ("wrench_bota", "error"): "status_invalid invalid_samples",
@@ -110,7 +117,7 @@ FORBIDDEN: dict[tuple[str, str], str] = {
 
 UNTOLD: dict[tuple[str, str], str] = {
     ("*", "clock_drift"): "not a fault: the time stamps follow the clock",
-    ("wrench_*", "stuck"): "a steady load looks the same",
+    ("*wrench*", "stuck"): "a steady load looks the same",
     ("pose_zenoh", "stuck"): "a robot that stands looks the same",
     ("wrench_kms40", "repeated"): "its samples have no number",
     ("wrench_robotous-*", "repeated"): "its samples have no number",

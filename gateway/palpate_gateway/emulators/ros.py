@@ -270,7 +270,11 @@ class RosHandEmulator(RosEmulator):
         if self.faulty("saturated"):
             return [_COUNTS_MAX] * 22, [_COUNTS_MAX] * 22
         slow = list(self._counts(t, finger))[: ELECTRODES + 3]
-        pac = [self._counts(t - 2 * (21 - k) / _SLOT_HZ, finger)[-1] for k in range(22)]
+        stuck = self._held_s is not None
+        pac = [
+            self._counts(t - (0 if stuck else 2 * (21 - k) / _SLOT_HZ), finger)[-1]
+            for k in range(22)
+        ]
         return slow, pac
 
     def _message(self, t: float, time_ns: int) -> bytes:

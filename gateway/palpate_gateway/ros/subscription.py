@@ -84,8 +84,8 @@ class RosMessage(NamedTuple, Generic[T]):
 class RosSubscription(Generic[T]):
     """One topic of one publisher; its own session through the router, so that nothing overtakes.
 
-    ``counters``: ``lost_messages`` (gaps in the publisher's numbers), ``late_messages_of_link``
-    (an earlier number again), ``other_publishers`` (messages of a second publisher, dropped),
+    ``counters``: ``lost_messages`` (gaps in the publisher's numbers), ``old_numbers``
+    (messages repeated or late), ``other_publishers`` (messages of a second publisher, dropped),
     ``bad_attachments``, ``queue_overflow``, and ``rejected_...`` by reason.
     """
 
@@ -101,7 +101,7 @@ class RosSubscription(Generic[T]):
     def _begin(self) -> None:
         self._counts: Counter[str] = Counter(
             dict.fromkeys(
-                ("lost_messages", "late_messages_of_link", "other_publishers", "bad_attachments"), 0
+                ("lost_messages", "old_numbers", "other_publishers", "bad_attachments"), 0
             )
         )
         self._overflow = 0
@@ -236,7 +236,7 @@ class RosSubscription(Generic[T]):
         self._heard_s = now_s
         lost = info.sequence - self._sequence - 1
         if lost < 0:
-            self._counts["late_messages_of_link"] += 1
+            self._counts["old_numbers"] += 1
             return -1
         self._sequence = info.sequence
         self._counts["lost_messages"] += lost

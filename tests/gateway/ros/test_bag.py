@@ -1,0 +1,172 @@
+"""Bags of ROS 1 and ROS 2 as devices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from tests.gateway.ros_fakes import (
+    BEGAN_NS,
+    electrodes_of,
+    hand_fields,
+    make_bag,
+    write_bag,
+)
+
+from palpate.errors import ConfigError, RecordingError
+from palpate.messages import Origin
+from palpate.ros.layouts import BIOTAC_ALL, BIOTAC_HAND, Dialect, encode
+from palpate_gateway.drivers import make_device
+from palpate_gateway.readings import ElectrodeReading, WrenchReading
+
+PERIOD_NS = 10_000_000
+
+
+def readings_of(path: Path, **options: Any) -> tuple[list[Any], dict[str, int]]:
+    with make_device("ros_bag", {"path": path, **options}) as device:
+        assert device.info.origin is Origin.REPLAYED
+        readings: list[Any] = []
+        while got := device.read(1.0):
+            readings += got
+        return readings, dict(device.counters)
+
+
+def fingers(readings: Sequence[Any]) -> list[ElectrodeReading]:
+    return [one for one in readings if isinstance(one, ElectrodeReading)]
+
+
+@pytest.mark.parametrize("dialect", ["ros1", "cdr"])
+@pytest.mark.parametrize("layout", [BIOTAC_HAND, BIOTAC_ALL])
+def test_all_readings_of_a_bag_come_in_the_order_of_their_times(
+    tmp_path: Path, dialect: Dialect, layout: str
+) -> None:
+    name = "run.bag" if dialect == "ros1" else "run"
+    path = make_bag(tmp_path / name, 30, dialect, layout=layout)
+    readings, counters = readings_of(path, wrench_topic="/ft")
+    times = [one.time_s for one in readings]
+    assert times == sorted(times)
+    more = 7 if layout == BIOTAC_HAND else 0
+    told = [one.electrodes.tolist() for one in fingers(readings)]
+    assert told == [[value + more for value in electrodes_of(k)] for k in range(30)]
+    wrenches = [one for one in readings if isinstance(one, WrenchReading)]
+    assert [one.force.tolist() for one in wrenches] == [[0.5, -1.5, k] for k in range(0, 30, 2)]
+    assert wrenches[0].serial == "ft"
+    # A wrench lies 3 ms after the begin of the frame of its number, as when it was measured.
+    begins = [one.time_s for one in fingers(readings)]
+    assert wrenches[4].time_s - begins[8] == pytest.approx(0.003)
+    assert counters["samples"] == 30
+    assert counters["rejected_messages"] == counters["missing_readings"] == 0
+
+
+def test_the_wall_clock_is_that_of_the_recording(tmp_path: Path) -> None:
+    with make_device("ros_bag", {"path": make_bag(tmp_path / "a.bag", 3)}) as device:
+        started_ns = device.identity.start_wall_ns
+        assert started_ns is not None
+        first = device.read(1.0)[0]
+        assert not isinstance(first, str)
+        assert started_ns + round(1e9 * first.time_s) == BEGAN_NS
+
+
+def test_the_indenter_feels_the_reaction(tmp_path: Path) -> None:
+    path = make_bag(tmp_path / "a.bag", 4)
+    readings, _ = readings_of(path, wrench_topic="/ft", mount={"carries": "indenter"})
+    forces = [one.force.tolist() for one in readings if isinstance(one, WrenchReading)]
+    assert forces == [[-0.5, 1.5, -k] for k in (0.0, 2.0)]
+
+
+@pytest.mark.parametrize("dialect", ["ros1", "cdr"])
+def test_messages_that_the_recorder_lost_are_missing_readings(
+    tmp_path: Path, dialect: Dialect
+) -> None:
+    name = "run.bag" if dialect == "ros1" else "run"
+    path = make_bag(tmp_path / name, 20, dialect, leave_out=lambda k: 5 <= k < 9)
+    readings, counters = readings_of(path)
+    assert [one.missed_before for one in readings] == [0] * 5 + [4] + [0] * 10
+    assert counters["missing_readings"] == 4
+
+
+def test_a_message_that_is_damaged_is_counted_and_the_others_come(tmp_path: Path) -> None:
+    payloads = [
+        encode(hand_fields(k, BEGAN_NS + PERIOD_NS * k), BIOTAC_HAND) for k in range(6)
+    ]
+    payloads[2] = payloads[2][:-30]
+    messages = [
+        ("/hand", BIOTAC_HAND, BEGAN_NS + PERIOD_NS * k, payload)
+        for k, payload in enumerate(payloads)
+    ]
+    readings, counters = readings_of(write_bag(tmp_path / "run", messages, "cdr"))
+    assert len(readings) == 5
+    assert counters["rejected_messages"] == 1
+    assert [one.missed_before for one in readings] == [0, 0, 1, 0, 0]
+
+
+def test_a_bag_of_several_topics_needs_a_choice(tmp_path: Path) -> None:
+    payload = encode(hand_fields(0, BEGAN_NS), BIOTAC_HAND)
+    both = [(name, BIOTAC_HAND, BEGAN_NS, payload) for name in ("/left", "/right")]
+    path = write_bag(tmp_path / "run", both, "cdr")
+    with pytest.raises(ConfigError, match=r"2 topics hold .*name one; it holds: /left"):
+        readings_of(path)
+    assert len(readings_of(path, topic="/right")[0]) == 1
+    with pytest.raises(ConfigError, match=r"/up holds no sr_robot_msgs"):
+        readings_of(path, topic="/up")
+    with pytest.raises(ConfigError, match=r"/left holds no geometry_msgs/msg/WrenchStamped"):
+        readings_of(path, topic="/right", wrench_topic="/left")
+
+
+def test_a_finger_that_is_not_in_the_bag_is_named(tmp_path: Path) -> None:
+    path = make_bag(tmp_path / "a.bag", 3)
+    with pytest.raises(RecordingError, match=r"no readings of finger 2 .*it has fingers \[1\]"):
+        readings_of(path, finger=2)
+    with pytest.raises(RecordingError, match="correct finger or serial"):
+        readings_of(path, serial="BT9")
+
+
+def test_another_version_of_a_message_is_refused(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    newer = "std_msgs/Header header\nuint16[24] electrodes\n"
+    store.register(get_types_from_msg(newer, BIOTAC_HAND))
+    with Writer(tmp_path / "a.bag") as bag:
+        connection = bag.add_connection("/hand", BIOTAC_HAND, typestore=store)
+        bag.write(connection, BEGAN_NS, bytes(100))
+    with pytest.raises(RecordingError, match="of another version"):
+        readings_of(tmp_path / "a.bag")
+
+
+@pytest.mark.parametrize("cut", [1, 200, 3000])
+def test_a_bag_that_was_cut_is_a_typed_error(tmp_path: Path, cut: int) -> None:
+    path = make_bag(tmp_path / "a.bag", 20)
+    path.write_bytes(path.read_bytes()[:-cut])
+    with pytest.raises(RecordingError, match=r"a\.bag"):
+        readings_of(path)
+
+
+def test_what_is_no_bag_is_a_typed_error(tmp_path: Path) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, 5000, np.uint8).tobytes()
+    for name, data in (("a.bag", b""), ("b.bag", noise), ("c.bag", b"#ROSBAG V2.0\n" + noise)):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(RecordingError, match="is no bag of ROS"):
+            readings_of(tmp_path / name)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(RecordingError, match="is no bag of ROS"):
+        readings_of(tmp_path / "folder")
+
+
+def test_bytes_flipped_anywhere_never_crash(tmp_path: Path) -> None:
+    path = make_bag(tmp_path / "a.bag", 6)
+    data = path.read_bytes()
+    random = np.random.default_rng(7)
+    for _ in range(60):
+        damaged = bytearray(data)
+        for at in random.integers(0, len(data), 8):
+            damaged[at] ^= 1 << int(random.integers(8))
+        path.write_bytes(damaged)
+        try:
+            readings, _ = readings_of(path, wrench_topic="/ft")
+        except (RecordingError, ConfigError):
+            continue
+        assert all(np.isfinite(one.time_s) for one in readings)
