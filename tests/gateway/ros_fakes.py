@@ -11,7 +11,6 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Writer as Writer2
 
 from palpate.ros.layouts import (
-    BIOTAC_ALL,
     BIOTAC_HAND,
     WRENCH_STAMPED,
     Dialect,
@@ -137,8 +136,8 @@ def make_bag(
             payload = encode(fields(k, time_ns, dialect), layout, dialect)
             messages.append(("/hand/tactile", layout, time_ns + 11_000_000, payload))
         if k % 2 == 0:
-            payload = encode(wrench_fields(k, time_ns + 3_000_000, dialect), WRENCH_STAMPED, dialect)
+            payload = encode(
+                wrench_fields(k, time_ns + 3_000_000, dialect), WRENCH_STAMPED, dialect
+            )
             messages.append(("/ft", WRENCH_STAMPED, time_ns + 12_000_000, payload))
     return write_bag(path, messages, dialect)
-
-

@@ -3,6 +3,7 @@
 Without ``from __future__ import annotations``: pycdr2 reads the annotations.
 """
 
+# mypy: disable-error-code="misc"
 from dataclasses import dataclass
 
 from pycdr2 import IdlStruct, types
@@ -96,3 +97,21 @@ class Point(IdlStruct):
 class PointStamped(IdlStruct):
     header: Header
     point: Point
+
+
+@dataclass
+class Features(IdlStruct):
+    header: Header
+    sensor_serial: str
+    sequence: types.uint64
+    in_contact: bool
+    force: Vector3
+    force_sd: Vector3
+    contact_location: Point
+    contact_location_sd: Vector3
+    centre_of_pressure: Point
+    centre_of_pressure_sd: Vector3
+    contact_normal: Vector3
+    contact_normal_sd: types.float64
+    quality: types.sequence[types.uint8]
+    bundle: str

@@ -32,6 +32,7 @@ START_ORDER: tuple[Service, ...] = (
     "router",
     "metrics",
     "recorder",
+    "ros_bridge",
     "synthesis",
     "field",
     "features",
@@ -90,6 +91,10 @@ def _entry_point(service: Service, profile: Profile) -> Callable[..., None]:
         from palpate_services.recorder.service import run_recorder
 
         return run_recorder
+    if service == "ros_bridge":
+        from palpate_services.ros_bridge import run_ros_bridge
+
+        return run_ros_bridge
     if service == "metrics":
         from palpate_deploy.station.metrics import run_metrics
 
@@ -101,6 +106,7 @@ def _entry_point(service: Service, profile: Profile) -> Callable[..., None]:
 
 _NEEDED: dict[str, tuple[str, tuple[str, ...]]] = {
     "metrics": ("metrics", ("prometheus_client",)),
+    "ros_bridge": ("services", ("rosbags",)),
     "features": ("services", ("onnxruntime",)),
     "field": ("services", ("onnxruntime",)),
     "synthesis": ("services", ("onnxruntime",)),

@@ -40,6 +40,7 @@ from palpate_services.config import (
     FieldServiceConfig,
     ModelsConfig,
     RecorderConfig,
+    RosBridgeConfig,
     SynthesisServiceConfig,
 )
 
@@ -50,7 +51,15 @@ ENV_PREFIX = "PALPATE_"
 ENV_NESTED = "__"
 
 Service = Literal[
-    "router", "gateway", "features", "field", "synthesis", "recorder", "fem", "metrics"
+    "router",
+    "gateway",
+    "features",
+    "field",
+    "synthesis",
+    "recorder",
+    "fem",
+    "metrics",
+    "ros_bridge",
 ]
 SERVICES: tuple[Service, ...] = ("router", "gateway", "features", "recorder")
 """What a station runs by default; a profile names the others if it needs them."""
@@ -123,6 +132,7 @@ class Profile(StrictConfig):
         models: The user's bundles, and what is remembered of those that serve.
         fem: How simulations are served, if ``processes`` names ``fem``.
         metrics: Where Prometheus finds metrics, if ``processes`` names ``metrics``.
+        ros_bridge: What nodes of ROS 2 get, if ``processes`` names ``ros_bridge``.
         log: What the processes write into their logs.
     """
 
@@ -138,6 +148,7 @@ class Profile(StrictConfig):
     models: ModelsConfig = Field(default_factory=ModelsConfig)
     fem: FemConfig = FemConfig()
     metrics: MetricsConfig = MetricsConfig()
+    ros_bridge: RosBridgeConfig = Field(default_factory=RosBridgeConfig)
     log: LogConfig = LogConfig()
 
     @field_validator("processes")

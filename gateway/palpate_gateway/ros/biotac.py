@@ -118,10 +118,11 @@ class RosBiotac(RosDevice):
         finger = self._track.find(early.message)
         if finger is None:
             self._topic.close()
-            there = [k for k, one in enumerate(early.message.fingers, 1) if one is not None]
+            places = [k for k, one in enumerate(early.message.fingers, 1) if one is not None]
+            there = ", ".join(map(str, places)) or "none"
             raise DeviceError(
                 f"{self.info.model}: no finger answers there",
-                remedy=f"there are: {', '.join(map(str, there)) or 'none'}; correct finger or serial",
+                remedy=f"there are: {there}; correct finger or serial",
             )
         self._there_s = time.monotonic()
         kind = finger.sensor_type

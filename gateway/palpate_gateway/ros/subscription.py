@@ -5,14 +5,20 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
 from palpate.bus import ForeignSubscriber, Session
 from palpate.config import LinkConfig, StrictConfig, TlsConfig, endpoint_host_port
-from palpate.errors import DeviceError, DeviceLost, DeviceTimeout, LinkError, StreamTimeout
-from palpate.errors import WireError
+from palpate.errors import (
+    DeviceError,
+    DeviceLost,
+    DeviceTimeout,
+    LinkError,
+    StreamTimeout,
+    WireError,
+)
 from palpate.ros.layouts import type_hash
 from palpate.ros.rmw_zenoh import RosNode, RosTopic, SampleInfo, check_topic_name
 from palpate_gateway.device import BusDevice
@@ -246,7 +252,7 @@ class RosSubscription(Generic[T]):
 class RosDevice(BusDevice):
     """A device behind a topic; subclasses set ``_topic``."""
 
-    _topic: RosSubscription
+    _topic: RosSubscription[Any]
 
     def join(self, link: LinkConfig, station: str) -> None:
         """See ``BusDevice``; a topic of ROS belongs to no station."""

@@ -91,7 +91,7 @@ class RosWrench(WrenchDevice, RosDevice):
 
     def zero(self) -> None:
         """See ``WrenchDevice``; takes 0.2 s."""
-        values = []
+        values: list[tuple[float, ...]] = []
         until = time.monotonic() + _ZERO_S
         while (left_s := until - time.monotonic()) > 0.0 or not values:
             message = self._topic.next(max(left_s, self._options.wait_s))

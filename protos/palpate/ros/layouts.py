@@ -6,9 +6,12 @@ compares their MD5 sums, by which ROS 1 tells versions of a message, with the pu
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from palpate.errors import WireError
 from palpate.process import require
@@ -25,10 +28,13 @@ WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 POINT_STAMPED = "geometry_msgs/msg/PointStamped"
 """A point [m] in the frame that the header names."""
 
+FEATURES = "palpate_msgs/msg/Features"
+"""All that palpate says of one frame of a finger; ours, so that it has no published MD5 sum."""
+
 Dialect = Literal["cdr", "ros1"]
 """How a message becomes bytes: ``cdr`` in ROS 2 and its bags, ``ros1`` in bags of ROS 1."""
 
-_TACTILE: dict[str, str] = {
+DEFINITIONS: dict[str, str] = {
     "biotac_sensors/msg/BioTacData": """
 string bt_serial
 uint16 bt_position
@@ -65,7 +71,24 @@ int16[] electrodes
 std_msgs/Header header
 Biotac[5] tactiles
 """,
+    FEATURES: """
+std_msgs/Header header
+string sensor_serial
+uint64 sequence
+bool in_contact
+geometry_msgs/Vector3 force
+geometry_msgs/Vector3 force_sd
+geometry_msgs/Point contact_location
+geometry_msgs/Vector3 contact_location_sd
+geometry_msgs/Point centre_of_pressure
+geometry_msgs/Vector3 centre_of_pressure_sd
+geometry_msgs/Vector3 contact_normal
+float64 contact_normal_sd
+uint8[] quality
+string bundle
+""",
 }
+"""Text of each layout that is not of ROS itself, as in its ``.msg`` file."""
 
 MD5 = {
     BIOTAC_HAND: "d96f900cbfb096d61de125081e11dcab",
@@ -92,7 +115,7 @@ def typestore(dialect: Dialect) -> Any:
     store = stores.get_typestore(base)
     store.max_sequence_length = _ELEMENTS_MAX
     types: dict[str, Any] = {}
-    for name, text in _TACTILE.items():
+    for name, text in DEFINITIONS.items():
         types |= typesys.get_types_from_msg(text, name)
     store.register(types)
     return store
@@ -171,6 +194,11 @@ def _built(store: Any, fields: Mapping[str, Any], layout: str) -> Any:
     if unknown := fields.keys() - values.keys():
         raise KeyError(f"unknown field {min(unknown)!r}")
     return store.types[layout](**values)
+
+
+def bytes_list(values: Iterable[int]) -> npt.NDArray[np.uint8]:
+    """Values of a field ``uint8[]``."""
+    return np.array([int(value) for value in values], np.uint8)
 
 
 def time_of(stamp: Any) -> int:

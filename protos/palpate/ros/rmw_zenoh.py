@@ -17,7 +17,10 @@ NO_TYPE_HASH = "TypeHashNotSupported"
 """What stands for the type hash in ROS 2 Humble."""
 
 GID_BYTES = 16
-"""Length of a publisher's id; 24 in Humble."""
+"""Length of a publisher's id."""
+
+GID_BYTES_HUMBLE = 24
+"""The same in ROS 2 Humble."""
 
 _NUMBERS = struct.Struct("<qq")
 
@@ -99,13 +102,18 @@ class SampleInfo:
         """
         at = _NUMBERS.size
         gid = attachment[at + 1 :]
-        if len(attachment) <= at or attachment[at] != len(gid) or len(gid) not in (GID_BYTES, 24):
+        if (
+            len(attachment) <= at
+            or attachment[at] != len(gid)
+            or len(gid) not in (GID_BYTES, GID_BYTES_HUMBLE)
+        ):
             raise WireError(
                 f"an attachment of {len(attachment)} bytes is none of rmw_zenoh",
                 remedy="publish with rmw_zenoh of ROS 2 Jazzy or later, or of Humble",
                 reason="attachment",
             )
-        return cls(*_NUMBERS.unpack_from(attachment), gid)
+        sequence, time_ns = _NUMBERS.unpack_from(attachment)
+        return cls(sequence, time_ns, gid)
 
 
 def _mangled(name: str) -> str:
@@ -130,7 +138,7 @@ class RosNode:
     @property
     def token(self) -> str:
         """Key of the node's liveliness token."""
-        return f"{self._head(0, 'NN')}"
+        return self._head(0, "NN")
 
     def publisher_token(self, topic: RosTopic) -> str:
         """Key of the liveliness token of one more publisher."""

@@ -91,9 +91,7 @@ def test_messages_that_the_recorder_lost_are_missing_readings(
 
 
 def test_a_message_that_is_damaged_is_counted_and_the_others_come(tmp_path: Path) -> None:
-    payloads = [
-        encode(hand_fields(k, BEGAN_NS + PERIOD_NS * k), BIOTAC_HAND) for k in range(6)
-    ]
+    payloads = [encode(hand_fields(k, BEGAN_NS + PERIOD_NS * k), BIOTAC_HAND) for k in range(6)]
     payloads[2] = payloads[2][:-30]
     messages = [
         ("/hand", BIOTAC_HAND, BEGAN_NS + PERIOD_NS * k, payload)

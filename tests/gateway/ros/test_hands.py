@@ -136,7 +136,9 @@ def test_every_valid_channel_is_what_was_sent_and_no_other_is_valid(
 
 @settings(max_examples=100, deadline=None)
 @given(hands, st.data())
-def test_damaged_bytes_are_a_typed_error_or_a_message(message: BiotacAll, data: st.DataObject) -> None:
+def test_damaged_bytes_are_a_typed_error_or_a_message(
+    message: BiotacAll, data: st.DataObject
+) -> None:
     payload = bytearray(message.serialize())
     for _ in range(3):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))

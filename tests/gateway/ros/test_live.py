@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from typing import Any
@@ -11,8 +12,8 @@ import pytest
 from tests.gateway.scenes import ramp, was_felt
 from tests.protos.ros_idl import WrenchStamped
 
-from palpate.config import joining_link
 from palpate.bus import Session
+from palpate.config import joining_link
 from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
 from palpate.messages import SensorType
 from palpate_gateway.device import Device
@@ -65,7 +66,7 @@ def test_repeats_at_the_controllers_rate_are_told_from_readings() -> None:
     with emulator, finger_at(emulator, rate_hz=90.9) as device:
         readings = take(device, 40)
         values = [reading.electrodes[4] for reading in readings]
-        assert all(a != b for a, b in zip(values, values[1:], strict=False))
+        assert all(a != b for a, b in itertools.pairwise(values))
         counters = device.counters
         assert counters["repeated_readings"] > 2 * counters["samples"]
         span_s = readings[-1].time_s - readings[0].time_s

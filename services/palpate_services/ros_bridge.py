@@ -1,0 +1,234 @@
+"""The process ``ros_bridge``: estimates and wrenches as topics of ROS 2, for nodes with rmw_zenoh.
+
+For each sensor, under the bridge's namespace: ``force`` (``WrenchStamped``, estimated; its torque
+is not a number, because features have none), ``contact_location`` and ``centre_of_pressure``
+(``PointStamped``, only in contact), ``features`` (``palpate_msgs/Features``, everything), and
+``wrench`` (``WrenchStamped``, measured by the finger's force/torque sensor). Headers hold the wall
+clock of the frame's first slot and the sensor frame. No ROS is needed on this side.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from palpate.bus import Delivery, ForeignPublisher, Session, TapSample
+from palpate.bus.topics import FEATURES, WRENCH
+from palpate.config import LinkConfig
+from palpate.errors import StreamTimeout, WireError
+from palpate.health import Health, HealthReporter
+from palpate.heartbeat import beat
+from palpate.messages import FeatureEstimate, ServiceState, WrenchFrame
+from palpate.process import avoid_pauses
+from palpate.ros import layouts
+from palpate.ros.rmw_zenoh import (
+    GID_BYTES,
+    GID_BYTES_HUMBLE,
+    NO_TYPE_HASH,
+    RosNode,
+    RosTopic,
+    SampleInfo,
+    gid_of,
+)
+from palpate_services.config import RosBridgeConfig
+
+SERVICE = "ros_bridge"
+NODE = "palpate"
+"""Name under which ``ros2 node list`` shows the bridge."""
+
+_WAIT_S = 0.2
+_SENSORS_MAX = 256
+"""Names come from other processes, and each takes publishers."""
+
+_NAN = math.nan
+
+
+class RosOutput(NamedTuple):
+    """A message for ROS: the last part of its topic's name, its layout, its fields."""
+
+    name: str
+    layout: str
+    fields: Mapping[str, Any]
+
+
+def run_ros_bridge(
+    config: RosBridgeConfig,
+    link: LinkConfig,
+    station: str,
+    stop: threading.Event,
+    *,
+    instance: str = SERVICE,
+) -> None:
+    """Publish for ROS until ``stop`` is set.
+
+    Raises:
+        LinkError: The station's bus cannot be joined, or the router of ROS.
+        MissingExtraError: ``rosbags`` is not installed.
+    """
+    layouts.typestore("cdr")
+    health = Health(SERVICE, instance)
+    changes: dict[str, object] = {"direct": False}
+    if config.connect:
+        changes |= {"connect": (config.connect,), "tls": config.tls}
+    with (
+        Session.open(link, station=station) as session,
+        Session.open(link.model_copy(update=changes)) as ros,
+        RosBridge(ros, config) as bridge,
+        session.tap([FEATURES, WRENCH], delivery=Delivery.QUEUE, capacity=config.capacity) as tap,
+    ):
+        presence = session.presence(SERVICE, instance=instance)
+
+        def refresh() -> None:
+            health.set_counts(tap.counters)
+
+        with HealthReporter(session, health, refresh=refresh):
+            avoid_pauses()
+            health.set_state(ServiceState.READY)
+            presence.ready()
+            while not stop.is_set():
+                beat()
+                try:
+                    sample = tap.next(_WAIT_S)
+                except StreamTimeout:
+                    continue
+                health.count(bridge.pass_on(sample))
+                health.worked()
+            presence.not_ready()
+            health.set_state(ServiceState.STOPPING)
+
+
+class RosBridge:
+    """The bridge as a node of ROS 2; a topic is announced when it has its first message.
+
+    Args:
+        session: At the router that ROS uses.
+        config: What to publish.
+    """
+
+    def __init__(self, session: Session, config: RosBridgeConfig) -> None:
+        self._session, self._config = session, config
+        self._node = RosNode(session.zid, NODE, config.domain)
+        self._node_token = session.foreign_token(self._node.token)
+        self._publishers: dict[tuple[str, str], _RosPublisher] = {}
+        self._sensors: set[str] = set()
+
+    def pass_on(self, sample: TapSample) -> str:
+        """Publish what a message of the station holds; the counter that counts it.
+
+        ``passed_on``, ``not_followed`` (of another sensor), ``rejected_...``.
+        """
+        wanted = self._config.sensors
+        if wanted and sample.sensor not in wanted:
+            return "not_followed"
+        if sample.sensor not in self._sensors:
+            if len(self._sensors) >= _SENSORS_MAX:
+                return "not_followed"
+            self._sensors.add(sample.sensor)
+        topic = FEATURES if sample.topic == FEATURES.name else WRENCH
+        try:
+            message = topic.codec.decode(sample.payload)
+        except WireError as error:
+            return f"rejected_{error.reason}"
+        frame_id = self._config.frame_ids.get(sample.sensor, sample.sensor)
+        for output in outputs_of(message, frame_id):
+            payload = layouts.encode(output.fields, output.layout)
+            self._publisher(sample.sensor, output).put(payload)
+        return "passed_on"
+
+    def _publisher(self, sensor: str, output: RosOutput) -> _RosPublisher:
+        known = self._publishers.get((sensor, output.name))
+        if known is None:
+            config = self._config
+            hashed = NO_TYPE_HASH if config.humble else layouts.type_hash(output.layout)
+            # Names of ROS have no '-', and do not begin with a digit.
+            part = sensor.replace("-", "_")
+            part = f"_{part}" if part[0].isdigit() else part
+            name = f"{config.namespace}/{part}/{output.name}"
+            topic = RosTopic(name, output.layout, hashed, config.domain)
+            token = self._node.publisher_token(topic)
+            gid = gid_of(token, GID_BYTES_HUMBLE if config.humble else GID_BYTES)
+            known = _RosPublisher(self._session, topic, token, gid)
+            self._publishers[sensor, output.name] = known
+        return known
+
+    def __enter__(self) -> RosBridge:
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        for publisher in self._publishers.values():
+            publisher.close()
+        self._node_token.close()
+
+
+class _RosPublisher:
+    """One topic: its publisher, its token, and the numbers of its messages."""
+
+    def __init__(self, session: Session, topic: RosTopic, token: str, gid: bytes) -> None:
+        self._publisher: ForeignPublisher = session.foreign_publisher(topic.key)
+        self._token = session.foreign_token(token)
+        self._gid, self._sequence = gid, 0
+
+    def put(self, payload: bytes) -> None:
+        self._sequence += 1
+        info = SampleInfo(self._sequence, time.time_ns(), self._gid)
+        self._publisher.put(payload, info.encode())
+
+    def close(self) -> None:
+        self._token.close()
+        self._publisher.close()
+
+
+def outputs_of(message: FeatureEstimate | WrenchFrame, frame_id: str) -> Iterator[RosOutput]:
+    """Messages for ROS that say what a message of palpate says.
+
+    Args:
+        message: Of one sensor.
+        frame_id: Name of its sensor frame in ROS.
+    """
+    if isinstance(message, WrenchFrame):
+        header = _header(message.stamp.wall_ns, frame_id)
+        wrench = {"force": _xyz(message.force), "torque": _xyz(message.torque)}
+        yield RosOutput("wrench", layouts.WRENCH_STAMPED, {"header": header, "wrench": wrench})
+        return
+    header = _header(message.source.wall_ns, frame_id)
+    wrench = {"force": _xyz(message.force), "torque": _xyz(None)}
+    yield RosOutput("force", layouts.WRENCH_STAMPED, {"header": header, "wrench": wrench})
+    points = (
+        ("contact_location", message.contact_location),
+        ("centre_of_pressure", message.centre_of_pressure),
+    )
+    for name, point in points:
+        if point is not None:
+            stamped = {"header": header, "point": _xyz(point)}
+            yield RosOutput(name, layouts.POINT_STAMPED, stamped)
+    normal_sd = message.contact_normal_sd
+    fields = {
+        "header": header,
+        "sensor_serial": message.sensor_serial,
+        "sequence": message.source.sequence,
+        "in_contact": message.in_contact,
+        "force": _xyz(message.force),
+        "force_sd": _xyz(message.force_sd),
+        "contact_location": _xyz(message.contact_location),
+        "contact_location_sd": _xyz(message.contact_location_sd),
+        "centre_of_pressure": _xyz(message.centre_of_pressure),
+        "centre_of_pressure_sd": _xyz(message.centre_of_pressure_sd),
+        "contact_normal": _xyz(message.contact_normal),
+        "contact_normal_sd": _NAN if normal_sd is None else normal_sd,
+        "quality": layouts.bytes_list(message.quality),
+        "bundle": f"{message.bundle_name}:{message.bundle_version}",
+    }
+    yield RosOutput("features", layouts.FEATURES, fields)
+
+
+def _header(wall_ns: int, frame_id: str) -> dict[str, Any]:
+    return {"stamp": layouts.stamp_of(wall_ns), "frame_id": frame_id}
+
+
+def _xyz(vector: Sequence[float] | Any | None) -> dict[str, float]:
+    """A vector or point as fields; of None every part is not a number."""
+    x, y, z = (_NAN,) * 3 if vector is None else map(float, vector)
+    return {"x": x, "y": y, "z": z}
