@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.gateway.ros_fakes import make_bag
 
 from palpate.bus.topics import ELECTRODES, FEATURES
 from palpate.files.record import read_record
+from palpate.ros.layouts import Dialect
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -54,6 +56,14 @@ def test_record_of_a_virtual_finger(
     account = _replay(palpate, virtual_record, tmp_path / "out")
     recorded = account["recorded"]
     assert {recorded[name] for name in ("electrodes", "wrench", "pose", "features")} == {300}
+
+
+@pytest.mark.parametrize("dialect", ["ros1", "cdr"])
+def test_bag_of_ros(palpate: Palpate, bundle: str, tmp_path: Path, dialect: Dialect) -> None:
+    path = make_bag(tmp_path / ("a.bag" if dialect == "ros1" else "a"), 120, dialect)
+    account = _replay(palpate, path, tmp_path / "out", "--bundle", bundle)
+    assert account["frames"] == account["recorded"]["electrodes"] == account["estimates"] == 120
+    assert account["missing_frames"] == 0
 
 
 def test_real_capture(palpate: Palpate, shared_data: Path, bundle: str, tmp_path: Path) -> None:

@@ -50,7 +50,11 @@ def record(
 
 def replay(
     file: Annotated[
-        Path, typer.Argument(help="A vendor's text log (plain or .gz) or a palpate .mcap.")
+        Path,
+        typer.Argument(
+            help="A vendor's text log (plain or .gz), a palpate .mcap, or a bag of ROS (.bag, or "
+            "the folder of ROS 2)."
+        ),
     ],
     pace: Annotated[
         ReplayPace,
@@ -65,13 +69,15 @@ def replay(
 ) -> None:
     """Send a file through gateway, features and recorder, and check that nothing is lost.
 
-    A log of one finger is played as sensor finger, one of several as finger-1, finger-2 and so on,
-    by their ports.
+    A log or bag of one finger is played as sensor finger, one of several as finger-1, finger-2 and
+    so on, by their ports.
     """
     from palpate_deploy.diagnose.replay import run_replay
 
     raise typer.Exit(
-        run_replay(existing_file(file), pace.value, out, bundle, rrd=rrd, as_json=json_)
+        run_replay(
+            existing_file(file, or_folder=True), pace.value, out, bundle, rrd=rrd, as_json=json_
+        )
     )
 
 

@@ -108,11 +108,11 @@ def station_link(
     return link, loaded.station if station == DEFAULT_STATION else station
 
 
-def existing_file(path: Path) -> Path:
-    """The path of an existing file; otherwise a ``ConfigError``."""
+def existing_file(path: Path, *, or_folder: bool = False) -> Path:
+    """The path of an existing file, ``or_folder``; otherwise a ``ConfigError``."""
     from palpate.errors import ConfigError
 
-    if not path.is_file():
+    if not (path.is_file() or (or_folder and path.is_dir())):
         raise ConfigError(f"{path} does not exist", remedy="check the path")
     return path
 

@@ -154,6 +154,7 @@ def print_account(account: ReplayAccount) -> None:
 
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
+_BAG_MAGIC = b"#ROSBAG"
 _POLL_S = 0.1
 _JOIN_S = 15.0
 _SETTLED_S = 20.0
@@ -208,14 +209,18 @@ def replay_profile(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool) 
 
 
 def sensors_of(file: Path) -> list[dict[str, Any]]:
-    """The gateway's sensors for a file: a record (by its magic bytes), else a text log.
+    """The gateway's sensors for a file: a record or bag (by its magic bytes), else a text log.
 
-    A log of one finger is the sensor ``finger``; one of several is a sensor for each, named by its
-    port, e.g. ``finger-1`` and ``finger-3``.
+    A log or bag of one finger is the sensor ``finger``; one of several is a sensor for each, named
+    by its port, e.g. ``finger-1`` and ``finger-3``. A folder is a bag of ROS 2.
     """
+    if file.is_dir():
+        return _fingers_of_bag(file)
     with open(file, "rb") as stream:
         head = stream.read(len(_MCAP_MAGIC))
     path = str(file.absolute())
+    if head.startswith(_BAG_MAGIC):
+        return _fingers_of_bag(file)
     if not head.startswith(_MCAP_MAGIC):
         return _fingers_of_log(file, path)
     from palpate_gateway.recordings.record import recorded_sensors
@@ -244,6 +249,27 @@ def _fingers_of_log(file: Path, path: str) -> list[dict[str, Any]]:
     return [
         {"name": f"finger-{port}", "driver": "text_log", "options": {"path": path, "port": port}}
         for port in ports
+    ]
+
+
+def _fingers_of_bag(file: Path) -> list[dict[str, Any]]:
+    from palpate_gateway.ros.bag import fingers_of_bag
+
+    path = str(file.absolute())
+    found: list[tuple[str, int]] = []
+    with contextlib.suppress(RecordingError):  # the driver tells it
+        found = fingers_of_bag(file)
+    if len(found) < 2:
+        # Its place need not be the first.
+        known = {"topic": found[0][0], "finger": found[0][1]} if found else {}
+        return [{"name": "finger", "driver": "ros_bag", "options": {"path": path, **known}}]
+    return [
+        {
+            "name": f"finger-{number}",
+            "driver": "ros_bag",
+            "options": {"path": path, "topic": topic, "finger": place},
+        }
+        for number, (topic, place) in enumerate(found, 1)
     ]
 
 

@@ -116,6 +116,10 @@ _END = (
     ),
     _option("seconds", 0, "End after this time [s]; 0 = at Ctrl-C.", type_=float, min=0),
 )
+_CONNECT = _option(
+    "connect", "", "Endpoint of a router, e.g. tcp/127.0.0.1:7447; else it runs its own."
+)
+_DOMAIN = _option("domain", 0, "ROS domain id.", min=0, max=232)
 _ON_WRENCH = (*_PLAY, _FINGER, *_END)
 _ON_FINGERS = (*_PLAY, _UNIT, *_END)
 
@@ -217,11 +221,7 @@ COMMANDS = {
         "A robot that carries an indenter and publishes the pose of its flange over Zenoh.",
         (
             _option("name", "arm", "Its name on the bus.", "--robot"),
-            _option(
-                "connect",
-                "",
-                "Endpoint of a router, e.g. tcp/127.0.0.1:7447; else it runs its own.",
-            ),
+            _CONNECT,
             _option(
                 "tls",
                 None,
@@ -236,6 +236,32 @@ COMMANDS = {
             *_ON_WRENCH,
         ),
         ("robot --rate-hz 1000", "robot --connect tcp/127.0.0.1:7447 --fault restart@20+2"),
+    ),
+    "ros-hand": EmulateCommand(
+        "A hand of BioTacs whose driver of ROS 2 publishes over rmw_zenoh.",
+        (
+            _choice("message", "What it publishes.", "BiotacAll", "BioTacHand"),
+            _option("topic", "/hand/tactile", "Its topic."),
+            _CONNECT,
+            _PORT,
+            _DOMAIN,
+            _fingers(5, "BioTacs that are connected."),
+            _option("rate_hz", 100, "Messages each second.", type_=float, min=1, max=2000),
+            *_ON_FINGERS,
+        ),
+        ("ros-hand --message BioTacHand", "ros-hand --connect tcp/127.0.0.1:7447 --fault lost@9+1"),
+    ),
+    "ros-wrench": EmulateCommand(
+        "A force/torque sensor whose driver of ROS 2 publishes over rmw_zenoh.",
+        (
+            _option("topic", "/ft/wrench", "Its topic."),
+            _CONNECT,
+            _PORT,
+            _DOMAIN,
+            _option("rate_hz", 500, "Messages each second.", type_=float, min=1, max=2000),
+            *_ON_WRENCH,
+        ),
+        ("ros-wrench --rate-hz 1000", "ros-wrench --connect tcp/127.0.0.1:7447 --fault nan@9+1"),
     ),
 }
 """The commands by name; ``emulate_devices`` has a maker for each device."""

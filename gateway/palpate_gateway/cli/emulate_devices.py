@@ -20,6 +20,7 @@ from palpate_gateway.ports.multicast import LOOPBACK, MULTICAST
 if TYPE_CHECKING:
     from palpate_gateway.emulators.biotac_slots import CountSource
     from palpate_gateway.emulators.robot import TipSource
+    from palpate_gateway.emulators.ros import RosEmulator
     from palpate_gateway.emulators.twin import TwinLoop
 
 Options = dict[str, Any]
@@ -273,13 +274,7 @@ def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> EmulatedDevice
 
     check_name(name, "robot")
     check_name(options["station"], "station")
-    if options["connect"]:
-        try:
-            endpoint_host_port(options["connect"])
-        except ValueError as error:
-            raise ConfigError(
-                f"--connect: {error}", remedy="name the router as palpate status shows it"
-            ) from error
+    _check_endpoint(options["connect"])
     tls = options["tls"]
     certificates = None if tls is None else TlsConfig.of_folder(tls).model_dump(mode="json")
     tip, indenter = scene.tip()
@@ -301,6 +296,42 @@ def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> EmulatedDevice
     return EmulatedDevice(emulator, "pose_zenoh", sensors)
 
 
+def _ros_hand(
+    scene: EmulatedScene, *, message: str, topic: str, fingers: int, **options: Any
+) -> EmulatedDevice:
+    from palpate.ros.rmw_zenoh import check_topic_name
+    from palpate_gateway.emulators.ros import RosHandEmulator
+
+    _check_endpoint(options["connect"])
+    emulator = RosHandEmulator(
+        scene.counts(fingers),
+        whole_frames=message == "BioTacHand",
+        fingers=fingers,
+        topic=check_topic_name(topic),
+        **options,
+    )
+    package = "biotac_sensors" if emulator.whole_frames else "sr_robot_msgs"
+
+    def sensors() -> list[tuple[str, Options]]:
+        shared = {**_topic_of(emulator), "message": f"{package}/{message}"}
+        return [(f"finger{k}", {**shared, "finger": k}) for k in range(1, fingers + 1)]
+
+    return EmulatedDevice(emulator, "ros_biotac", sensors)
+
+
+def _ros_wrench(scene: EmulatedScene, *, topic: str, **options: Any) -> EmulatedDevice:
+    from palpate.ros.rmw_zenoh import check_topic_name
+    from palpate_gateway.emulators.ros import RosWrenchEmulator
+
+    _check_endpoint(options["connect"])
+    emulator = RosWrenchEmulator(scene.wrench(), topic=check_topic_name(topic), **options)
+
+    def sensors() -> list[tuple[str, Options]]:
+        return [("wrench", {**_topic_of(emulator), "rate_hz": emulator.rate_hz})]
+
+    return EmulatedDevice(emulator, "ros_wrench", sensors)
+
+
 _MAKERS: dict[str, Callable[..., EmulatedDevice]] = {
     "kms40": _kms40,
     "rdt": _rdt,
@@ -310,6 +341,8 @@ _MAKERS: dict[str, Callable[..., EmulatedDevice]] = {
     "biotac-bridge": _biotac_bridge,
     "biotac-pic32": _biotac_pic32,
     "robot": _robot,
+    "ros-hand": _ros_hand,
+    "ros-wrench": _ros_wrench,
 }
 
 
@@ -322,6 +355,22 @@ def _sequence(electrodes: str, *, pac_first: bool) -> Options:
     """The order of a round, if it is not the default one."""
     kind = {"19": "biotac", "24": "biotac_sp"}[electrodes]
     return {"sequence": f"{kind}_pac_first"} if pac_first else {}
+
+
+def _topic_of(emulator: RosEmulator) -> Options:
+    domain = {"domain": emulator.domain} if emulator.domain else {}
+    return {"topic": emulator.topic, "connect": emulator.address, **domain}
+
+
+def _check_endpoint(connect: str) -> None:
+    if not connect:
+        return
+    try:
+        endpoint_host_port(connect)
+    except ValueError as error:
+        raise ConfigError(
+            f"--connect: {error}", remedy="name the router as palpate status shows it"
+        ) from error
 
 
 def _host_port(emulator: Emulator) -> Options:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +26,9 @@ from palpate_gateway.ros.wrench import decode_wrench
 from palpate_gateway.wrench.device import Mount, MountOptions
 
 _TACTILE = (BIOTAC_ALL, BIOTAC_HAND)
+
+_LOOK = 20
+"""Messages that show which fingers a bag has."""
 
 
 class RosBagOptions(RosFingerOptions):
@@ -146,6 +151,24 @@ class _Closed:
 
     def __exit__(self, *exc_info: object) -> None:
         self._reader.close()
+
+
+def fingers_of_bag(path: Path) -> list[tuple[str, int]]:
+    """Topic and place of each finger in the first messages of a bag.
+
+    Raises:
+        RecordingError: It is no bag.
+    """
+    bag = RosBagFile(path)
+    found: set[tuple[str, int]] = set()
+    for topic, layout in bag.topics.items():
+        if layout not in _TACTILE:
+            continue
+        for payload, _ in islice(bag.messages(topic), _LOOK):
+            with contextlib.suppress(WireError):
+                hand = decode_hand(payload, layout, bag.dialect)
+                found |= {(topic, k) for k, one in enumerate(hand.fingers, 1) if one is not None}
+    return sorted(found)
 
 
 class RosBag(FileDevice):
