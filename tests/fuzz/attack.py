@@ -13,7 +13,7 @@ from tests.fuzz.corpus import TARGETS, load_target
 
 from palpate.process import require
 
-_WATCHED = ("palpate_gateway", "palpate.files.record", "mcap")
+_WATCHED = ("palpate_gateway", "palpate.files.record", "palpate.ros", "mcap")
 """Packages whose branches count as coverage."""
 
 

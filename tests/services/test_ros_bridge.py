@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 import threading
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,8 @@ from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError, StreamTimeout
 from palpate.messages import FeatureEstimate, Origin, QualityFlag, Stamp, WrenchFrame
+from palpate.ros.layouts import DEFINITIONS
+from palpate.ros.layouts import FEATURES as FEATURES_LAYOUT
 from palpate_services.config import RosBridgeConfig
 from palpate_services.ros_bridge import run_ros_bridge
 
@@ -205,3 +209,12 @@ def test_humble_has_no_type_hash(link: LinkConfig, until: Until) -> None:
 def test_wrong_settings_are_refused(values: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(values))):
         parse_config(RosBridgeConfig, values, where="ros_bridge")
+
+
+def test_the_page_for_users_of_ros_has_our_message_and_a_valid_table() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "ros.md").read_text(encoding="utf-8")
+    assert f"```{DEFINITIONS[FEATURES_LAYOUT]}```" in page
+    table = page.partition("```toml\n")[2].partition("```")[0]
+    values = tomllib.loads(table)
+    assert "ros_bridge" in values["processes"]
+    parse_config(RosBridgeConfig, values["ros_bridge"], where="docs/ros.md")
