@@ -19,7 +19,7 @@ from palpate_gateway.drivers import driver_names, find_driver
 BY_ID = Path("/dev/serial/by-id")
 """Names of serial ports that do not depend on the USB socket."""
 
-_DISTRIBUTION = {"can": "python-can", "serial": "pyserial"}
+_DISTRIBUTION = {"can": "python-can", "serial": "pyserial", "rosbags": "rosbags"}
 
 _NOT_HARDWARE = frozenset({"virtual", "udp_multicast", "serial", "socketcand"})
 """Interfaces without hardware, or that python-can finds only by seconds of network traffic."""

@@ -1,4 +1,4 @@
-"""A force/torque sensor whose driver speaks only ROS: ``geometry_msgs/WrenchStamped``."""
+"""A force/torque sensor whose driver speaks only ROS: WrenchStamped."""
 
 from __future__ import annotations
 
