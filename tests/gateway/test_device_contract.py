@@ -29,6 +29,7 @@ from palpate_gateway.readings import (
 )
 
 PATIENCE_S = 20.0
+ON_THE_BUS = ("pose_zenoh", "ros_biotac", "ros_wrench")
 SOME = 12
 """Readings that are worth to be looked at."""
 
@@ -325,9 +326,9 @@ class Held:
     def settled(cls, bench: Bench) -> Held:
         """Of this process when an emulator beside it opens nothing more.
 
-        The robot's own router opens a link to itself up to a second after it serves.
+        A router of the emulator's own opens a link to itself up to a second after it serves.
         """
-        quiet_s = 2.0 if bench.case.driver == "pose_zenoh" else 0.0
+        quiet_s = 2.0 if bench.case.driver in ON_THE_BUS else 0.0
         since_s, held = time.monotonic(), cls.now()
         deadline_s = since_s + PATIENCE_S
         while time.monotonic() - since_s < quiet_s and time.monotonic() < deadline_s:

@@ -16,7 +16,7 @@ from palpate.messages import Origin, SensorType
 from palpate.ros.layouts import BIOTAC_ALL, BIOTAC_HAND
 from palpate_gateway.device import SERIAL_MAX, DeviceIdentity, DeviceInfo
 from palpate_gateway.protocols.ros_hands import RosHand, decode_hand
-from palpate_gateway.readings import Reading
+from palpate_gateway.readings import ElectrodeReading, Reading
 from palpate_gateway.ros.finger_track import Channel, FingerTrack
 from palpate_gateway.ros.subscription import (
     RosDevice,
@@ -142,19 +142,20 @@ class RosBiotac(RosDevice):
     def _read(self, timeout_s: float) -> list[Reading]:
         until = time.monotonic() + timeout_s
         while True:
-            message, self._early = self._early, None
-            if message is None:
-                message = self._topic.next(max(until - time.monotonic(), 0.0))
-            reading = self._reading(message)
-            if reading is not None:
-                return [reading]
+            early, self._early = self._early, None
+            left_s = max(until - time.monotonic(), 0.0)
+            messages = self._topic.take(left_s) if early is None else [early]
+            readings: list[Reading] = []
+            readings += [one for message in messages if (one := self._reading(message))]
+            if readings:
+                return readings
             if time.monotonic() >= until:
                 raise DeviceTimeout(
                     f"{self.info.model}: no new reading within {timeout_s:g} s",
                     remedy="messages come, but repeat the last one: check the driver of the hand",
                 )
 
-    def _reading(self, message: RosMessage[RosHand]) -> Reading | None:
+    def _reading(self, message: RosMessage[RosHand]) -> ElectrodeReading | None:
         hand = message.message
         if not hand.time_ns:
             time_ns = message.sent_ns or message.arrival_ns

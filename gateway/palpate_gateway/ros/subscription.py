@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -27,6 +28,9 @@ T = TypeVar("T")
 
 NODE = "palpate_gateway"
 """Name under which ``ros2 node list`` shows this end."""
+
+_BATCH = 64
+"""Largest number of waiting messages that are taken at once."""
 
 _OTHER_S = 0.5
 """A publisher that has been silent for so long is replaced when another one publishes [s]."""
@@ -186,6 +190,15 @@ class RosSubscription(Generic[T]):
         session, self._session, self._subscriber = self._session, None, None
         if session is not None:
             session.close()
+
+    def take(self, timeout_s: float) -> list[RosMessage[T]]:
+        """The next message, and those that have come already; the errors are those of ``next``."""
+        messages = [self.next(timeout_s)]
+        assert self._subscriber is not None
+        with contextlib.suppress(DeviceTimeout):  # what waited was nothing to deliver
+            for _ in range(min(self._subscriber.waiting, _BATCH)):
+                messages.append(self.next(0.0))
+        return messages
 
     def next(self, timeout_s: float) -> RosMessage[T]:
         """The next message of the publisher that is followed.

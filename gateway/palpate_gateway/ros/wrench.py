@@ -119,11 +119,9 @@ class RosWrench(WrenchDevice, RosDevice):
         return {**self._topic.counters, **self._order}
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
-        message, self._early = self._early, None
-        if message is None:
-            message = self._topic.next(timeout_s)
-        reading = self._take(message)
-        return () if reading is None else (reading,)
+        early, self._early = self._early, None
+        messages = self._topic.take(timeout_s) if early is None else [early]
+        return [reading for one in messages if (reading := self._take(one)) is not None]
 
     def _take(self, message: RosMessage[RosWrenchMessage]) -> WrenchReading | None:
         time_ns = message.message.time_ns or message.sent_ns or message.arrival_ns

@@ -58,6 +58,11 @@ class ForeignSubscriber(Closing):
         """``received``, and ``overflow``: samples that found no place to wait."""
         return dict(self._counters)
 
+    @property
+    def waiting(self) -> int:
+        """How many samples wait."""
+        return len(self._waiting)
+
     def next(self, timeout_s: float) -> ForeignSample:
         """The next sample.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from palpate.errors import WireError
@@ -54,10 +56,10 @@ def seeds() -> list[bytes]:
     """A message of each kind, good and cut, and an attachment."""
     found = [b"\x06" + SampleInfo(1, 2, bytes(range(16))).encode()]
     for mode, dialect in enumerate(_DIALECTS):
-        header = {"stamp": stamp_of(1_700_000_000_000_000_000), "frame_id": "hand"}
+        header: dict[str, Any] = {"stamp": stamp_of(1_700_000_000_000_000_000), "frame_id": "hand"}
         header |= {"seq": 7} if dialect == "ros1" else {}
         counts = np.arange(2000, 2024)
-        tactiles = [
+        tactiles: list[dict[str, Any]] = [
             {"pac0": 2040, "pac1": 2041, "pdc": 2600, "tac": 2045, "tdc": 1914}
             | {"electrodes": counts[:number].astype(np.int16)}
             for number in (19, 24, 0, 19, 3)

@@ -200,6 +200,15 @@ class TestWrench:
                     assert np.abs([one.force for one in readings]).max() < 1e-9
                     assert device.counters.get("zero_lost", 0) == 0
 
+    def test_none_waits_at_a_thousand_messages_a_second(self) -> None:
+        with RosWrenchEmulator(ramp, rate_hz=1000.0) as emulator:
+            values = {"topic": emulator.topic, "connect": emulator.address, "rate_hz": 1000}
+            with make_device("ros_wrench", values) as device:
+                last: WrenchReading = take(device, 1500)[-1]
+                assert last.observed is not None
+                assert time.monotonic_ns() - last.observed.arrival_ns < 300_000_000
+                assert device.counters["lost_messages"] == device.counters["queue_overflow"] == 0
+
     def test_a_number_that_is_none_is_dropped(self) -> None:
         with RosWrenchEmulator(ramp) as emulator:
             values = {"topic": emulator.topic, "connect": emulator.address}
