@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from palpate.ros.layouts import (
@@ -100,7 +101,9 @@ Written = tuple[str, str, int, bytes]
 """Topic, layout, time of recording [ns], bytes."""
 
 
-def write_bag(path: Path, messages: Sequence[Written], dialect: Dialect) -> Path:
+def write_bag(
+    path: Path, messages: Sequence[Written], dialect: Dialect, storage: str = "sqlite3"
+) -> Path:
     """A bag of ROS 1 (a file) or ROS 2 (a folder) with these messages."""
     store = typestore(dialect)
     connections: dict[str, Any] = {}
@@ -111,7 +114,7 @@ def write_bag(path: Path, messages: Sequence[Written], dialect: Dialect) -> Path
                     connections[topic] = bag1.add_connection(topic, layout, typestore=store)
                 bag1.write(connections[topic], time_ns, payload)
         return path
-    with Writer2(path, version=9) as bag2:
+    with Writer2(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as bag2:
         for topic, layout, time_ns, payload in messages:
             if topic not in connections:
                 connections[topic] = bag2.add_connection(topic, layout, typestore=store)
@@ -126,6 +129,7 @@ def make_bag(
     *,
     layout: str = BIOTAC_HAND,
     leave_out: Callable[[int], bool] = lambda k: False,
+    storage: str = "sqlite3",
 ) -> Path:
     """A bag of one finger at 100 Hz on ``/hand/tactile``, and a wrench at 50 Hz on ``/ft``."""
     fields = hand_fields if layout == BIOTAC_HAND else all_fields
@@ -140,4 +144,4 @@ def make_bag(
                 wrench_fields(k, time_ns + 3_000_000, dialect), WRENCH_STAMPED, dialect
             )
             messages.append(("/ft", WRENCH_STAMPED, time_ns + 12_000_000, payload))
-    return write_bag(path, messages, dialect)
+    return write_bag(path, messages, dialect, storage)

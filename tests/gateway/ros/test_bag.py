@@ -63,6 +63,16 @@ def test_all_readings_of_a_bag_come_in_the_order_of_their_times(
     assert counters["rejected_messages"] == counters["missing_readings"] == 0
 
 
+def test_a_bag_in_mcap_is_that_in_sqlite(tmp_path: Path) -> None:
+    both = [
+        readings_of(make_bag(tmp_path / storage, 12, "cdr", storage=storage), wrench_topic="/ft")
+        for storage in ("sqlite3", "mcap")
+    ]
+    assert list((tmp_path / "mcap").glob("*.mcap"))
+    assert repr(both[0]) == repr(both[1])
+    assert len(both[1][0]) == 18
+
+
 def test_the_wall_clock_is_that_of_the_recording(tmp_path: Path) -> None:
     with make_device("ros_bag", {"path": make_bag(tmp_path / "a.bag", 3)}) as device:
         started_ns = device.identity.start_wall_ns
