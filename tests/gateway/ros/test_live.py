@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import struct
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +21,12 @@ from palpate.messages import SensorType
 from palpate_gateway.device import Device
 from palpate_gateway.drivers import make_device
 from palpate_gateway.emulators.biotac_slots import idle_counts
-from palpate_gateway.emulators.ros import RosEmulator, RosHandEmulator, RosWrenchEmulator
+from palpate_gateway.emulators.ros import (
+    WRENCH_KEY,
+    RosEmulator,
+    RosHandEmulator,
+    RosWrenchEmulator,
+)
 from palpate_gateway.readings import ElectrodeReading, Reading, WrenchReading
 
 HAND = "biotac_sensors/BioTacHand"
@@ -173,6 +180,35 @@ def test_the_subscription_shows_in_the_graph_of_ros() -> None:
 def test_what_is_no_topic_is_refused(topic: str) -> None:
     with pytest.raises(ConfigError, match="topic"):
         make_device("ros_wrench", {"topic": topic})
+
+
+def test_a_publisher_that_is_a_peer_as_nodes_of_ros_are_is_heard() -> None:
+    """Nodes with rmw_zenoh are peers that link to one another; drivers here go by the router."""
+    with RosHandEmulator() as router:
+        link = joining_link(router.address, wait_s=5.0)
+        assert link.direct
+        payload = [RosWrenchEmulator(ramp)._message(0.0, 10**9 + k) for k in range(400)]
+        with Session.open(link) as node:
+            publisher = node.foreign_publisher(f"0/peer/wrench/{WRENCH_KEY}")
+            stop = threading.Event()
+
+            def publish() -> None:
+                for k, one in enumerate(payload, 1):
+                    publisher.put(one, struct.pack("<qqB", k, k, 16) + bytes(16))
+                    if stop.wait(0.02):
+                        return
+
+            thread = threading.Thread(target=publish)
+            thread.start()
+            try:
+                values = {"topic": "/peer/wrench", "connect": router.address}
+                with make_device("ros_wrench", values) as device:
+                    last: WrenchReading = take(device, 20)[-1]
+                    assert was_felt(last.force, last.torque)
+                    assert device.counters["lost_messages"] == 0
+            finally:
+                stop.set()
+                thread.join()
 
 
 class TestWrench:
