@@ -105,6 +105,37 @@ class TlsConfig(StrictConfig):
         return cls(**paths)
 
 
+class RouterOptions(StrictConfig):
+    """A router that may be another than one's own.
+
+    Attributes:
+        connect: Endpoint of the router; empty = one's own.
+        tls: Certificates for that router.
+    """
+
+    connect: str = ""
+    tls: TlsConfig | None = None
+
+    @field_validator("connect")
+    @classmethod
+    def _is_endpoint(cls, value: str) -> str:
+        if value:
+            endpoint_host_port(value)
+        return value
+
+    @model_validator(mode="after")
+    def _tls_has_a_router(self) -> RouterOptions:
+        if self.tls is not None and not self.connect:
+            raise ValueError("tls is for the router that connect names, and connect is empty")
+        return self
+
+    def changed(self, link: LinkConfig, **changes: object) -> LinkConfig:
+        """A link with this router, if one is named, and with other changes."""
+        if self.connect:
+            changes |= {"connect": (self.connect,), "tls": self.tls}
+        return link.model_copy(update=changes)
+
+
 class LinkConfig(StrictConfig):
     """How a process joins the bus.
 

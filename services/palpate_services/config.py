@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
-from palpate.config import Name, StrictConfig, TlsConfig, endpoint_host_port
+from palpate.config import Name, RouterOptions, StrictConfig
 from palpate.process import data_folder, state_folder
 from palpate.ros.rmw_zenoh import check_topic_name
 
@@ -189,8 +189,10 @@ class RecorderConfig(StrictConfig):
         return self
 
 
-class RosBridgeConfig(StrictConfig):
+class RosBridgeConfig(RouterOptions):
     """The bridge to ROS: what is published for nodes of ROS 2 with rmw_zenoh.
+
+    The router, ``connect`` and ``tls``, is the one that ROS uses (``rmw_zenohd``).
 
     Attributes:
         sensors: Sensors to publish; empty = every sensor of the station.
@@ -198,8 +200,6 @@ class RosBridgeConfig(StrictConfig):
         frame_ids: Frame of each sensor in the headers, by sensor; else the sensor's name.
         domain: ROS domain id.
         humble: The nodes run ROS 2 Humble, whose keys have no type hash.
-        connect: Endpoint of the router that ROS uses (``rmw_zenohd``); empty = the station's own.
-        tls: Certificates for that router.
         capacity: Messages that may wait to be published.
     """
 
@@ -208,21 +208,12 @@ class RosBridgeConfig(StrictConfig):
     frame_ids: dict[Name, str] = Field(default_factory=dict, max_length=256)
     domain: int = Field(default=0, ge=0, le=232)
     humble: bool = False
-    connect: str = ""
-    tls: TlsConfig | None = None
     capacity: int = Field(default=1024, ge=16)
 
     @field_validator("namespace")
     @classmethod
     def _is_namespace(cls, value: str) -> str:
         return check_topic_name(value)
-
-    @field_validator("connect")
-    @classmethod
-    def _is_endpoint(cls, value: str) -> str:
-        if value:
-            endpoint_host_port(value)
-        return value
 
 
 EVERYTHING: dict[str, float] = {

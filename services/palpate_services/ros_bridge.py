@@ -70,12 +70,9 @@ def run_ros_bridge(
     """
     layouts.typestore("cdr")
     health = Health(SERVICE, instance)
-    changes: dict[str, object] = {"direct": False}
-    if config.connect:
-        changes |= {"connect": (config.connect,), "tls": config.tls}
     with (
         Session.open(link, station=station) as session,
-        Session.open(link.model_copy(update=changes)) as ros,
+        Session.open(config.changed(link, direct=False)) as ros,
         RosBridge(ros, config) as bridge,
         session.tap([FEATURES, WRENCH], delivery=Delivery.QUEUE, capacity=config.capacity) as tap,
     ):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import select
 import signal
 import subprocess
 import sys
@@ -344,9 +345,14 @@ def answered(*answers: bytes) -> tuple[str, int | None]:
     """Run the command in a terminal, and type; ``0`` stands for the last choice of a question."""
     pid, terminal = pty.fork()
     if pid == 0:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a test run in the background ignores it
         os.execv(NEW_STATION[0], NEW_STATION)
     said, left, answered_to = b"", list(answers), 0
     while True:
+        if not select.select([terminal], [], [], PATIENCE_S)[0]:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            pytest.fail(f"it waits for ever after: {said.decode()}")
         try:
             said += os.read(terminal, 1024)
         except OSError:  # it has ended

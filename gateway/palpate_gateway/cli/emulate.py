@@ -119,6 +119,14 @@ _END = (
 _CONNECT = _option(
     "connect", "", "Endpoint of a router, e.g. tcp/127.0.0.1:7447; else it runs its own."
 )
+_TLS = _option(
+    "tls",
+    None,
+    "Folder of certificates for a router tls/HOST:PORT: ca.pem, cert.pem, key.pem.",
+    type_=Path | None,
+    metavar="FOLDER",
+    envvar="PALPATE_TLS",
+)
 _DOMAIN = _option("domain", 0, "ROS domain id.", min=0, max=232)
 _ON_WRENCH = (*_PLAY, _FINGER, *_END)
 _ON_FINGERS = (*_PLAY, _UNIT, *_END)
@@ -222,14 +230,7 @@ COMMANDS = {
         (
             _option("name", "arm", "Its name on the bus.", "--robot"),
             _CONNECT,
-            _option(
-                "tls",
-                None,
-                "Folder of certificates for a router tls/HOST:PORT: ca.pem, cert.pem, key.pem.",
-                type_=Path | None,
-                metavar="FOLDER",
-                envvar="PALPATE_TLS",
-            ),
+            _TLS,
             _PORT,
             _option("station", "lab", "Station on which it publishes."),
             _option("rate_hz", 250, "Poses each second.", type_=float, min=1, max=2000),
@@ -243,6 +244,7 @@ COMMANDS = {
             _choice("message", "What it publishes.", "BiotacAll", "BioTacHand"),
             _option("topic", "/hand/tactile", "Its topic."),
             _CONNECT,
+            _TLS,
             _PORT,
             _DOMAIN,
             _fingers(5, "BioTacs that are connected."),
@@ -256,6 +258,7 @@ COMMANDS = {
         (
             _option("topic", "/ft/wrench", "Its topic."),
             _CONNECT,
+            _TLS,
             _PORT,
             _DOMAIN,
             _option("rate_hz", 500, "Messages each second.", type_=float, min=1, max=2000),

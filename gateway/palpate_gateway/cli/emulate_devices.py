@@ -275,8 +275,7 @@ def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> EmulatedDevice
     check_name(name, "robot")
     check_name(options["station"], "station")
     _check_endpoint(options["connect"])
-    tls = options["tls"]
-    certificates = None if tls is None else TlsConfig.of_folder(tls).model_dump(mode="json")
+    certificates = _certificates(options["tls"])
     tip, indenter = scene.tip()
     emulator = RobotEmulator(tip, robot=name, **options)
 
@@ -287,7 +286,7 @@ def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> EmulatedDevice
             "station": emulator.station,
             "rate_hz": emulator.rate_hz,
             "indenter": indenter,
-            **({} if certificates is None else {"tls": certificates}),
+            **certificates,
         }
         for key, pose in (("base_sensor", BASE_SENSOR), ("flange_indenter", FLANGE_INDENTER)):
             sensor[key] = {"position_m": pose.position, "orientation_wxyz": pose.orientation}
@@ -303,6 +302,7 @@ def _ros_hand(
     from palpate_gateway.emulators.ros import RosHandEmulator
 
     _check_endpoint(options["connect"])
+    certificates = _certificates(options["tls"])
     emulator = RosHandEmulator(
         scene.counts(fingers),
         whole_frames=message == "BioTacHand",
@@ -313,7 +313,7 @@ def _ros_hand(
     package = "biotac_sensors" if emulator.whole_frames else "sr_robot_msgs"
 
     def sensors() -> list[tuple[str, Options]]:
-        shared = {**_topic_of(emulator), "message": f"{package}/{message}"}
+        shared = {**_topic_of(emulator), "message": f"{package}/{message}", **certificates}
         return [(f"finger{k}", {**shared, "finger": k}) for k in range(1, fingers + 1)]
 
     return EmulatedDevice(emulator, "ros_biotac", sensors)
@@ -324,10 +324,11 @@ def _ros_wrench(scene: EmulatedScene, *, topic: str, **options: Any) -> Emulated
     from palpate_gateway.emulators.ros import RosWrenchEmulator
 
     _check_endpoint(options["connect"])
+    certificates = _certificates(options["tls"])
     emulator = RosWrenchEmulator(scene.wrench(), topic=check_topic_name(topic), **options)
 
     def sensors() -> list[tuple[str, Options]]:
-        return [("wrench", {**_topic_of(emulator), "rate_hz": emulator.rate_hz})]
+        return [("wrench", {**_topic_of(emulator), "rate_hz": emulator.rate_hz, **certificates})]
 
     return EmulatedDevice(emulator, "ros_wrench", sensors)
 
@@ -360,6 +361,11 @@ def _sequence(electrodes: str, *, pac_first: bool) -> Options:
 def _topic_of(emulator: RosEmulator) -> Options:
     domain = {"domain": emulator.domain} if emulator.domain else {}
     return {"topic": emulator.topic, "connect": emulator.address, **domain}
+
+
+def _certificates(folder: Path | None) -> Options:
+    """The option of a driver that joins the same router."""
+    return {} if folder is None else {"tls": TlsConfig.of_folder(folder).model_dump(mode="json")}
 
 
 def _check_endpoint(connect: str) -> None:

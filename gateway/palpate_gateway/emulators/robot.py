@@ -6,23 +6,21 @@ Without the address of a router it runs its own, at a loopback port.
 from __future__ import annotations
 
 import secrets
-import socket
 import struct
-import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
-from palpate.bus import Publisher, Session, run_router
+from palpate.bus import Publisher, Session
 from palpate.bus.topics import ROBOT_POSE
-from palpate.config import joining_link
 from palpate.errors import LinkError
 from palpate.messages import Pose, RobotPoseFrame
 from palpate.rigid import compose, inverse
 from palpate_gateway.emulators import FAULTS
-from palpate_gateway.emulators.emulator import Emulator, SampleTicker, set_lead
+from palpate_gateway.emulators.emulator import SampleTicker, set_lead
+from palpate_gateway.emulators.routed import RoutedEmulator
 
 TipSource = Callable[[float], Pose]
 """Gives the pose of the tip in the sensor frame at a time of the emulator's own [s]."""
@@ -33,7 +31,6 @@ BASE_SENSOR = Pose((0.4, 0.0, 0.1), (0.0, 1.0, 0.0, 0.0))
 FLANGE_INDENTER = Pose((0.0, 0.0, 0.12), (1.0, 0.0, 0.0, 0.0))
 """Pose of the indenter: a straight tool."""
 
-_JOIN_S = 5.0
 _BACK_NS = 5_000_000_000
 _NAN, _TOO_LONG = struct.pack("<d", float("nan")), struct.pack("<d", 2.0)
 
@@ -49,7 +46,7 @@ def slow_approach(t: float) -> Pose:
     return Pose((-0.004, 0.0, -0.016 + 0.007 * share), (1.0, 0.0, 0.0, 0.0))
 
 
-class RobotEmulator(Emulator):
+class RobotEmulator(RoutedEmulator):
     """Publishes poses of a flange that carries an indenter.
 
     Faults:
@@ -78,57 +75,27 @@ class RobotEmulator(Emulator):
         station: str = "lab",
         drift_ppm: float = 200.0,
     ) -> None:
-        super().__init__(rate_hz)
+        super().__init__(rate_hz, connect, port, tls)
         self.robot, self.station = robot, station
         self._tip, self._drift = tip, drift_ppm * 1e-6
-        self._connect, self._tls, self._port = connect, tls, port
-        self._router: threading.Thread | None = None
-        self._session: Session | None = None
         self._publisher: Publisher[RobotPoseFrame] | None = None
         self._late = b""
         self._away = False
         self._began_s = 0.0
         self._begin(0)
 
-    @property
-    def address(self) -> str:
-        """Endpoint of the router."""
-        return self._connect or f"tcp/127.0.0.1:{self._port}"
-
     def _begin(self, tick: int) -> None:
         """Start its program."""
         self._run_id = secrets.randbits(64) or 1
         self._sequence, self._first_tick = 0, tick
 
-    def _listen(self) -> None:
-        if not self._connect:
-            with socket.create_server(("127.0.0.1", self._port)) as free:
-                self._port = free.getsockname()[1]
-            listen = (self.address,)
-            self._router = threading.Thread(target=run_router, args=(listen, self._stop))
-            self._router.start()
-        try:
-            self._join()
-        except LinkError:
-            self._stop.set()
-            self._hang_up()
-            raise
-
     def _join(self) -> None:
-        link = joining_link(self.address, wait_s=_JOIN_S, tls=self._tls)
-        self._session = Session.open(link, station=self.station)
+        self._session = Session.open(self._link(), station=self.station)
         self._publisher = self._session.publisher(ROBOT_POSE, sensor=self.robot)
 
     def _leave(self) -> None:
-        session, self._session, self._publisher = self._session, None, None
-        if session is not None:
-            session.close()
-
-    def _hang_up(self) -> None:
-        self._leave()
-        if self._router is not None:
-            self._router.join(_JOIN_S)
-            self._router = None
+        self._publisher = None
+        super()._leave()
 
     def _serve(self) -> None:
         ticker = SampleTicker(self.rate_hz, self._stop)

@@ -11,29 +11,26 @@ offsets those of a round that begins with E1, and the header's time is that of p
 from __future__ import annotations
 
 import secrets
-import socket
 import struct
-import threading
 import time
 from abc import abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import ClassVar
 
-from palpate.bus import ForeignPublisher, Session, run_router
-from palpate.config import joining_link
+from palpate.bus import ForeignPublisher, Session
 from palpate.errors import LinkError
 from palpate_gateway.emulators import FAULTS
 from palpate_gateway.emulators.biotac_slots import ELECTRODES, CountSource, idle_counts
 from palpate_gateway.emulators.emulator import (
-    Emulator,
     SampleTicker,
     WrenchSource,
     set_lead,
     slow_press,
 )
+from palpate_gateway.emulators.routed import RoutedEmulator
 
-_JOIN_S = 5.0
 _SLOT_HZ = 4400.0
 _COUNTS_MAX = 4095
 _BACK_NS = 5_000_000_000
@@ -81,7 +78,7 @@ class CdrWriter:
         return b"\x00\x01\x00\x00" + bytes(self._body)
 
 
-class RosEmulator(Emulator):
+class RosEmulator(RoutedEmulator):
     """A node of ROS with one publisher; without the address of a router it runs its own.
 
     Faults:
@@ -105,15 +102,14 @@ class RosEmulator(Emulator):
         rate_hz: float,
         *,
         connect: str = "",
+        tls: Path | None = None,
         port: int = 0,
         domain: int = 0,
         drift_ppm: float = 200.0,
     ) -> None:
-        super().__init__(rate_hz)
+        super().__init__(rate_hz, connect, port, tls)
         self.topic, self.domain = topic, domain
-        self._connect, self._port, self._drift = connect, port, drift_ppm * 1e-6
-        self._router: threading.Thread | None = None
-        self._session: Session | None = None
+        self._drift = drift_ppm * 1e-6
         self._publisher: ForeignPublisher | None = None
         self._held: tuple[bytes, bytes] | None = None
         self._away = False
@@ -123,31 +119,12 @@ class RosEmulator(Emulator):
         """Start the node."""
         self._gid, self._sequence = secrets.token_bytes(16), 0
 
-    @property
-    def address(self) -> str:
-        """Endpoint of the router."""
-        return self._connect or f"tcp/127.0.0.1:{self._port}"
-
     @abstractmethod
     def _message(self, t: float, time_ns: int) -> bytes:
         """The message of what is measured at a time of the emulator's own [s]."""
 
-    def _listen(self) -> None:
-        if not self._connect:
-            with socket.create_server(("127.0.0.1", self._port)) as free:
-                self._port = free.getsockname()[1]
-            arguments = ((self.address,), self._stop)
-            self._router = threading.Thread(target=run_router, args=arguments)
-            self._router.start()
-        try:
-            self._join()
-        except LinkError:
-            self._stop.set()
-            self._hang_up()
-            raise
-
     def _join(self) -> None:
-        link = joining_link(self.address, wait_s=_JOIN_S).model_copy(update={"direct": False})
+        link = self._link().model_copy(update={"direct": False})
         self._session = session = Session.open(link)
         name = self.topic.strip("/")
         head = f"@ros2_lv/{self.domain}/{session.zid}/0"
@@ -158,15 +135,8 @@ class RosEmulator(Emulator):
         self._publisher = session.foreign_publisher(f"{self.domain}/{name}/{self.type_key}")
 
     def _leave(self) -> None:
-        session, self._session, self._publisher = self._session, None, None
-        if session is not None:
-            session.close()
-
-    def _hang_up(self) -> None:
-        self._leave()
-        if self._router is not None:
-            self._router.join(_JOIN_S)
-            self._router = None
+        self._publisher = None
+        super()._leave()
 
     def _serve(self) -> None:
         ticker = SampleTicker(self.rate_hz, self._stop)
@@ -248,12 +218,13 @@ class RosHandEmulator(RosEmulator):
         topic: str = "/hand/tactile",
         rate_hz: float = 100.0,
         connect: str = "",
+        tls: Path | None = None,
         port: int = 0,
         domain: int = 0,
         drift_ppm: float = 200.0,
     ) -> None:
         super().__init__(
-            topic, rate_hz, connect=connect, port=port, domain=domain, drift_ppm=drift_ppm
+            topic, rate_hz, connect=connect, tls=tls, port=port, domain=domain, drift_ppm=drift_ppm
         )
         self._counts, self._fingers, self.whole_frames = counts, fingers, whole_frames
 
@@ -330,12 +301,13 @@ class RosWrenchEmulator(RosEmulator):
         topic: str = "/ft/wrench",
         rate_hz: float = 500.0,
         connect: str = "",
+        tls: Path | None = None,
         port: int = 0,
         domain: int = 0,
         drift_ppm: float = 200.0,
     ) -> None:
         super().__init__(
-            topic, rate_hz, connect=connect, port=port, domain=domain, drift_ppm=drift_ppm
+            topic, rate_hz, connect=connect, tls=tls, port=port, domain=domain, drift_ppm=drift_ppm
         )
         self._source = source
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field
 
 from palpate.bus import Delivery, ReceivedMessage, Session, Subscriber
 from palpate.bus.topics import ROBOT_POSE
-from palpate.config import LinkConfig, Name, TlsConfig, endpoint_host_port
+from palpate.config import LinkConfig, Name, RouterOptions
 from palpate.errors import DeviceLost, DeviceTimeout, LinkError, StreamTimeout
 from palpate.messages import Origin, RobotPoseFrame
 from palpate_gateway.device import BusDevice, DeviceIdentity, DeviceInfo
@@ -21,37 +21,20 @@ _BATCH = 64
 """Largest number of readings in one answer of ``read``."""
 
 
-class PoseZenohOptions(PlacementOptions):
+class PoseZenohOptions(PlacementOptions, RouterOptions):
     """Options of the ``pose_zenoh`` driver.
 
     Attributes:
         robot: Name under which the robot's program publishes.
         rate_hz: Rate of its poses [Hz]; a gap longer than 40 ms and three periods is a silence.
         station: Station on which it publishes; empty = the gateway's own.
-        connect: Endpoint of the router; empty = the gateway's own.
-        tls: Certificates for that router.
         timeout_s: Longest time to join the bus [s].
     """
 
     robot: Name
     rate_hz: float = Field(default=ROBOT_POSE.rate_hz, gt=0.0, le=10_000.0)
     station: Name | None = None
-    connect: str = ""
-    tls: TlsConfig | None = None
     timeout_s: float = Field(default=2.0, gt=0.0, le=60.0)
-
-    @field_validator("connect")
-    @classmethod
-    def _is_endpoint(cls, value: str) -> str:
-        if value:
-            endpoint_host_port(value)
-        return value
-
-    @model_validator(mode="after")
-    def _tls_has_a_router(self) -> PoseZenohOptions:
-        if self.tls is not None and not self.connect:
-            raise ValueError("tls is for the router that connect names, and connect is empty")
-        return self
 
 
 class PoseZenoh(BusDevice):
@@ -90,10 +73,7 @@ class PoseZenoh(BusDevice):
         """See ``BusDevice``; the options take precedence."""
         options = self._options
         own = LinkConfig()
-        changes: dict[str, object] = {"wait_for_router_s": options.timeout_s, "listen": own.listen}
-        if options.connect:
-            changes |= {"connect": (options.connect,), "tls": options.tls}
-        self._link = link.model_copy(update=changes)
+        self._link = options.changed(link, wait_for_router_s=options.timeout_s, listen=own.listen)
         self._station = options.station or station
 
     def _open(self) -> DeviceIdentity:

@@ -8,10 +8,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from palpate.bus import ForeignSubscriber, Session
-from palpate.config import LinkConfig, StrictConfig, TlsConfig, endpoint_host_port
+from palpate.config import LinkConfig, RouterOptions
 from palpate.errors import (
     DeviceError,
     DeviceLost,
@@ -36,22 +36,20 @@ _OTHER_S = 0.5
 """A publisher that has been silent for so long is replaced when another one publishes [s]."""
 
 
-class RosTopicOptions(StrictConfig):
+class RosTopicOptions(RouterOptions):
     """Options of every driver that receives a topic of ROS 2 over rmw_zenoh.
+
+    The router, ``connect`` and ``tls``, is the one that ROS uses (``rmw_zenohd``).
 
     Attributes:
         topic: Full name, as ``ros2 topic list`` shows it.
         domain: ROS domain id.
-        connect: Endpoint of the router that ROS uses (``rmw_zenohd``); empty = the gateway's own.
-        tls: Certificates for that router.
         timeout_s: Longest time to join [s].
         wait_s: Longest time to the first message [s].
     """
 
     topic: str
     domain: int = Field(default=0, ge=0, le=232)
-    connect: str = ""
-    tls: TlsConfig | None = None
     timeout_s: float = Field(default=2.0, gt=0.0, le=60.0)
     wait_s: float = Field(default=3.0, gt=0.0, le=60.0)
 
@@ -59,19 +57,6 @@ class RosTopicOptions(StrictConfig):
     @classmethod
     def _is_topic(cls, value: str) -> str:
         return check_topic_name(value)
-
-    @field_validator("connect")
-    @classmethod
-    def _is_endpoint(cls, value: str) -> str:
-        if value:
-            endpoint_host_port(value)
-        return value
-
-    @model_validator(mode="after")
-    def _tls_has_a_router(self) -> RosTopicOptions:
-        if self.tls is not None and not self.connect:
-            raise ValueError("tls is for the router that connect names, and connect is empty")
-        return self
 
 
 class RosMessage(NamedTuple, Generic[T]):
@@ -123,10 +108,7 @@ class RosSubscription(Generic[T]):
         """The gateway's own way to the bus; the options take precedence."""
         options = self._options
         # Through the router only: a client needs no listener, and every message takes one path.
-        changes: dict[str, object] = {"direct": False, "wait_for_router_s": options.timeout_s}
-        if options.connect:
-            changes |= {"connect": (options.connect,), "tls": options.tls}
-        self._link = link.model_copy(update=changes)
+        self._link = options.changed(link, direct=False, wait_for_router_s=options.timeout_s)
 
     @property
     def counters(self) -> Mapping[str, int]:
