@@ -310,8 +310,9 @@ def page(found: dict[str, Any], networks: dict[str, list[dict[str, Any]]]) -> st
         shots = shots_table(reports)
         if shots:
             text += [SHOTS.format(**reports[0]["cells"][list(CELLS)[-1]]["shots"]), shots]
-    last = list(networks.values())[-1][0]
-    return "\n".join([*text, "![network](population/network.png)", "", told(last)])
+    *others, last = (reports[0] for reports in networks.values())
+    end = [told(last), *(beside(other) for other in others)]
+    return "\n".join([*text, "![network](population/network.png)", "", *end])
 
 
 HEAD = """# A population of simulated BioTacs
@@ -365,8 +366,13 @@ TOLD = """## What it says
   {offset:.2f} N.
 * **On real fingers it does not help**: `palpate train transfer --pretrained` is worse with it than
   without on both fingers (LOG). What touched them is not known; a plate, which is not among the
-  set's indenters, explains them as well as any ([fit to a sensor](twin/sensor-fit.md)).
+  set's indenters, explains them as well as any ([fit to a sensor](twin/sensor-fit.md)).\
 """
+
+
+BESIDE = """* **{name}** know fingers that were met better, {met:.3f} N and {met_hard:.0f} % from 2 N, and
+  those that were not worse, {ten:.2f} N with ten presses: specimens of the training are then known
+  by heart, and presses of others count for less."""
 
 
 def told(report: dict[str, Any]) -> str:
@@ -388,6 +394,19 @@ def told(report: dict[str, Any]) -> str:
         hard=ten["network"]["force_from_2n_percent"],
         hard_learned=learned["network"]["force_from_2n_percent"],
         offset=max(ten[f"network, all {offset}"][key] for offset in ("+0.05", "-0.05")),
+    )
+
+
+def beside(report: dict[str, Any]) -> str:
+    """What another network has that does not know unknown fingers as well."""
+    met, never = (report["cells"][cell] for cell in list(CELLS)[1::2])
+    key, hard = "force_magnitude_n", "force_from_2n_percent"
+    ten = never["shots"]["10"]["network"]
+    return BESIDE.format(
+        name=report["name"],
+        met=met["network"][key],
+        met_hard=met["network"][hard],
+        ten=ten[key],
     )
 
 
