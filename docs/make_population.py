@@ -370,9 +370,9 @@ TOLD = """## What it says
 """
 
 
-BESIDE = """* **{name}** know fingers that were met better, {met:.3f} N and {met_hard:.0f} % from 2 N,
-  and those that were not worse, {ten:.2f} N with ten presses: specimens of the training are then
-  known by heart, and presses of others count for less."""
+BESIDE = """* **{name}** know fingers that were met better, {met:.3f} N and {met_hard:.0f} %
+  from 2 N, and those that were not worse, {ten:.2f} N with ten presses: specimens of the training
+  are then known by heart, and presses of others count for less."""
 
 
 def told(report: dict[str, Any]) -> str:
