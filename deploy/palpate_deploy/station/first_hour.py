@@ -182,12 +182,14 @@ def tare_finger(session: Session) -> Tare:
 
     Raises:
         RemoteError: It is touched for a minute.
+        LinkError: Nobody answers for a minute; a session that has just joined may not know yet who
+            does.
     """
     until = time.monotonic() + _LET_GO_S
     while True:
         try:
             return ask_tare(session, FINGER, frames=0, timeout_s=_ASK_S)
-        except RemoteError:
+        except (RemoteError, LinkError):
             if time.monotonic() >= until:
                 raise
             time.sleep(_AGAIN_S)
