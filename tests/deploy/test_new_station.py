@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.errors import ConfigError, StreamTimeout
+from palpate.errors import ConfigError, LinkError, StreamTimeout
 from palpate_deploy.cli.app import app
 from palpate_deploy.station import first_hour, new_station
 from palpate_deploy.station.profile import load_profile
@@ -462,3 +462,24 @@ class TestZero:
         session, _ = bench([2900.0] * 100_000)
         with pytest.raises(StreamTimeout, match="was touched for"):
             first_hour.zero_wrench(session, tare)
+
+
+def test_a_session_that_does_not_know_yet_who_answers_asks_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[str] = []
+    tare = MagicMock()
+
+    def ask(*_: object, **__: object) -> object:
+        asked.append("")
+        if len(asked) < 3:
+            raise LinkError("no service answers", remedy="start the service")
+        return tare
+
+    monkeypatch.setattr(first_hour, "ask_tare", ask)
+    monkeypatch.setattr(first_hour, "_AGAIN_S", 0.0)
+    assert first_hour.tare_finger(MagicMock()) is tare
+    monkeypatch.setattr(first_hour, "_LET_GO_S", 0.0)
+    asked.clear()
+    with pytest.raises(LinkError):
+        first_hour.tare_finger(MagicMock())
