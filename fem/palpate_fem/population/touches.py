@@ -98,7 +98,7 @@ class SensorTouches:
 
 
 def held(counts: Floats, *, rows: int = HELD_ROWS, still: float = STILL_COUNTS) -> list[slice]:
-    """Stretches of a recording in which all electrodes are still, longest first grown.
+    """Stretches of a recording in which all electrodes are still, each as long as it can be.
 
     Args:
         counts: In order of time, shape (T, 19).

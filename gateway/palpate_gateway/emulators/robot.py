@@ -9,13 +9,11 @@ import secrets
 import struct
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
 from palpate.bus import Publisher, Session
 from palpate.bus.topics import ROBOT_POSE
-from palpate.errors import LinkError
 from palpate.messages import Pose, RobotPoseFrame
 from palpate.rigid import compose, inverse
 from palpate_gateway.emulators import FAULTS
@@ -62,6 +60,7 @@ class RobotEmulator(RoutedEmulator):
     """
 
     faults: ClassVar = FAULTS["robot"]
+    _publisher: Publisher[RobotPoseFrame] | None
 
     def __init__(
         self,
@@ -78,9 +77,7 @@ class RobotEmulator(RoutedEmulator):
         super().__init__(rate_hz, connect, port, tls)
         self.robot, self.station = robot, station
         self._tip, self._drift = tip, drift_ppm * 1e-6
-        self._publisher: Publisher[RobotPoseFrame] | None = None
         self._late = b""
-        self._away = False
         self._began_s = 0.0
         self._begin(0)
 
@@ -92,10 +89,6 @@ class RobotEmulator(RoutedEmulator):
     def _join(self) -> None:
         self._session = Session.open(self._link(), station=self.station)
         self._publisher = self._session.publisher(ROBOT_POSE, sensor=self.robot)
-
-    def _leave(self) -> None:
-        self._publisher = None
-        super()._leave()
 
     def _serve(self) -> None:
         ticker = SampleTicker(self.rate_hz, self._stop)
@@ -129,19 +122,6 @@ class RobotEmulator(RoutedEmulator):
         self._late = b""
         if self.faulty("repeated"):
             self._tell(payload)
-
-    def _gone(self) -> bool:
-        """Whether its program does not run, or is not on the bus."""
-        if self.faulty("restart"):
-            self._away = True
-            return True
-        if self.faulty("unplug"):
-            self._leave()
-            return True
-        if self._publisher is None:
-            with suppress(LinkError):  # the router is away, too; it tries again
-                self._join()
-        return self._publisher is None
 
     def _payload(self, tick: int, tip: Pose) -> bytes:
         time_ns = _BACK_NS + round(1e9 * (tick - self._first_tick) / self.rate_hz)

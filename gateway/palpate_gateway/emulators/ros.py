@@ -15,12 +15,10 @@ import struct
 import time
 from abc import abstractmethod
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
 from palpate.bus import ForeignPublisher, Session
-from palpate.errors import LinkError
 from palpate_gateway.emulators import FAULTS
 from palpate_gateway.emulators.biotac_slots import ELECTRODES, CountSource, idle_counts
 from palpate_gateway.emulators.emulator import (
@@ -93,6 +91,7 @@ class RosEmulator(RoutedEmulator):
     * ``clock_drift``: its loop and the times of its headers run at another speed.
     """
 
+    _publisher: ForeignPublisher | None
     type_key: ClassVar[str]
     """Type and type hash in its key."""
 
@@ -110,9 +109,7 @@ class RosEmulator(RoutedEmulator):
         super().__init__(rate_hz, connect, port, tls)
         self.topic, self.domain = topic, domain
         self._drift = drift_ppm * 1e-6
-        self._publisher: ForeignPublisher | None = None
         self._held: tuple[bytes, bytes] | None = None
-        self._away = False
         self._begin()
 
     def _begin(self) -> None:
@@ -134,10 +131,6 @@ class RosEmulator(RoutedEmulator):
         session.foreign_token(f"{head}/1/MP/{node}/{mangled}/{self.type_key}/::,10:,:,:,,")
         self._publisher = session.foreign_publisher(f"{self.domain}/{name}/{self.type_key}")
 
-    def _leave(self) -> None:
-        self._publisher = None
-        super()._leave()
-
     def _serve(self) -> None:
         ticker = SampleTicker(self.rate_hz, self._stop)
         began_s, began_ns = time.monotonic(), time.time_ns()
@@ -155,19 +148,12 @@ class RosEmulator(RoutedEmulator):
 
     def _gone(self) -> bool:
         """Whether the node does not run, hangs, or is not on the bus."""
-        if self.faulty("restart"):
-            self._away = True
+        if super()._gone():
             return True
-        if self.faulty("unplug"):
-            self._leave()
-            return True
-        if self._publisher is None:
-            with suppress(LinkError):  # the router is away, too; it tries again
-                self._join()
         if self._away:
             self._away = False
             self._begin()
-        return self._publisher is None or self.faulty("silence")
+        return self.faulty("silence")
 
     def _step(self, t: float, time_ns: int) -> None:
         self._sequence += 1

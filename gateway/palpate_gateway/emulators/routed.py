@@ -5,9 +5,11 @@ from __future__ import annotations
 import socket
 import threading
 from abc import abstractmethod
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from palpate.bus import Session, run_router
+from palpate.bus import ForeignPublisher, Publisher, Session, run_router
 from palpate.config import LinkConfig, joining_link
 from palpate.errors import LinkError
 from palpate_gateway.emulators.emulator import Emulator
@@ -31,6 +33,8 @@ class RoutedEmulator(Emulator):
         self._connect, self._port, self._tls = connect, port, tls
         self._router: threading.Thread | None = None
         self._session: Session | None = None
+        self._publisher: Publisher[Any] | ForeignPublisher | None = None
+        self._away = False
 
     @property
     def address(self) -> str:
@@ -47,9 +51,25 @@ class RoutedEmulator(Emulator):
 
     def _leave(self) -> None:
         """Close the session."""
-        session, self._session = self._session, None
+        session, self._session, self._publisher = self._session, None, None
         if session is not None:
             session.close()
+
+    def _gone(self) -> bool:
+        """Whether its program does not run, or is not on the bus.
+
+        After the fault ``restart``, ``_away`` says that the program has to begin again.
+        """
+        if self.faulty("restart"):
+            self._away = True
+            return True
+        if self.faulty("unplug"):
+            self._leave()
+            return True
+        if self._publisher is None:
+            with suppress(LinkError):  # the router is away, too; it tries again
+                self._join()
+        return self._publisher is None
 
     def _listen(self) -> None:
         if not self._connect:

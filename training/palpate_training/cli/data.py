@@ -15,7 +15,7 @@ from palpate.errors import ConfigError
 from palpate.files.hdf5 import schema_of
 from palpate.process import typed_command
 from palpate_training.cli.experiment import new_table, print_trials, show
-from palpate_training.datasets.experiment import MIXED_SCHEMA
+from palpate_training.datasets.experiment import MIXED_SCHEMA, MixedDataset
 from palpate_training.datasets.export import UNTOUCHED_ROWS, export_csv, export_published, features
 from palpate_training.datasets.features import (
     FEATURE_COLUMNS,
@@ -198,8 +198,7 @@ def data_shrink(
     size = SmallSize(trials, rows, modes, force_modes)
     with console.status(f"reading {path.name}"):
         small = shrink_file(path, out, size, command=typed_command())
-    console.print(experiment_table(experiment_contents(MIXED_SCHEMA.name, small), str(out)))
-    console.print(f"{out.stat().st_size / 1e6:.1f} MB")
+    _show_written(small, out)
 
 
 def data_join(
@@ -224,7 +223,12 @@ def data_join(
         joint = join_files(
             paths, out, modes=modes, force_modes=force_modes, command=typed_command()
         )
-    console.print(experiment_table(experiment_contents(MIXED_SCHEMA.name, joint), str(out)))
+    _show_written(joint, out)
+
+
+def _show_written(data: MixedDataset, out: Path) -> None:
+    """What a mixed data set that was just written holds, and its size."""
+    console.print(experiment_table(experiment_contents(MIXED_SCHEMA.name, data), str(out)))
     console.print(f"{out.stat().st_size / 1e6:.1f} MB")
 
 
