@@ -1,4 +1,4 @@
-"""An invented population: electrodes of specimens differ by one gain, told by their rest or not."""
+"""An invented population: electrodes of specimens differ by one gain, which only presses tell."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SMALL = PopulationConfig(
     threads=1,
     width=32,
     blocks=1,
-    rest_width=16,
+    told_width=16,
     press_width=32,
     code=8,
     gain_sd=0.0,
@@ -43,11 +43,15 @@ def pattern(force: Floats, place: Floats) -> Floats:
 
 
 def population(
-    *, told: bool = True, specimens: int = SPECIMENS, presses: int = PRESSES, each: int = 4
+    *,
+    specimens: int = SPECIMENS,
+    presses: int = PRESSES,
+    each: int = 4,
+    gain_sd: float = 0.4,
 ) -> FeatureDataset:
-    """Each press on some specimens. A specimen's gain is told by its rest alone, or not at all."""
+    """Each press on some specimens, whose gain the electrodes at rest do not tell."""
     rng = np.random.default_rng(0)
-    gain = np.exp(rng.normal(0.0, 0.4, specimens))
+    gain = np.exp(rng.normal(0.0, gain_sd, specimens))
     columns: dict[str, list[npt.NDArray[np.generic]]] = {
         name: [] for name in ("electrodes", "baseline", "force", "group", "sensor", "location")
     }
@@ -56,9 +60,7 @@ def population(
         most = rng.uniform(1.0, 5.0) * np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, 0.7, 3)
         force = np.linspace(0.0, 1.0, ROWS)[:, None] * most
         for specimen in rng.choice(specimens, each, replace=False):
-            ratio = (
-                0.5 * (np.sqrt(gain[specimen]) if told else 1.0) * np.exp(rng.normal(0.0, 0.01, 19))
-            )
+            ratio = 0.5 * np.exp(rng.normal(0.0, 0.01, 19))
             logs = gain[specimen] * pattern(force, place)
             counts = np.rint(4095.0 / (1.0 + ratio * np.exp(logs)))
             columns["electrodes"].append(counts.astype(np.uint16))

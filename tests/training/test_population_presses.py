@@ -21,12 +21,11 @@ from palpate_training.learning.population_fit import PopulationRows
 from palpate_training.learning.population_net import (
     WEIGHTS,
     PopulationNet,
-    inputs_of,
     load_population_net,
 )
 from palpate_training.learning.press_set import CalibrationPresses
 from palpate_training.systems.transfer import ForceTransfer, LabelledPresses, Pretrained
-from palpate_training.tasks.population import REPORT, points_of, targets_of, train_population
+from palpate_training.tasks.population import REPORT, rows_of, train_population
 from palpate_training.tasks.population_errors import SHOTS, draw_shots, shots_table
 
 UNSEEN = "unseen_specimen_unseen_press"
@@ -34,14 +33,12 @@ UNSEEN = "unseen_specimen_unseen_press"
 
 @pytest.fixture(scope="module")
 def data() -> FeatureDataset:
-    return population(told=False, specimens=24, presses=120, each=12)
+    return population(specimens=24, presses=120, each=12)
 
 
 @pytest.fixture(scope="module")
 def rows(data: FeatureDataset) -> PopulationRows:
-    inputs = inputs_of(data.electrodes, data.baseline)
-    _, targets = targets_of(data)
-    return PopulationRows(inputs, targets, data.sensor, data.group, points_of(data))
+    return rows_of(data)[1]
 
 
 @pytest.fixture(scope="module")
@@ -66,10 +63,10 @@ def presses(rows: PopulationRows) -> CalibrationPresses:
 
 def mirrored(net: PopulationNet, presses: CalibrationPresses) -> CalibrationPresses:
     image = net.mirrored_presses(presses.tensor()).numpy()
-    return CalibrationPresses(image[:, :38], image[:, 38:41], presses.press)
+    return CalibrationPresses(image[:, :19], image[:, 19:22], presses.press)
 
 
-def test_a_press_tells_what_the_rest_does_not(folder: Path) -> None:
+def test_a_press_tells_what_electrodes_do_not(folder: Path) -> None:
     shots = json.loads((folder / REPORT).read_text())["cells"][UNSEEN]["shots"]
     none, one, five = (shots[key]["network"]["force_magnitude_n"] for key in ("0", "1", "5"))
     assert one < 0.6 * none
@@ -108,7 +105,7 @@ def test_mirrored_presses_and_rows_get_the_mirrored_estimate(
     net: PopulationNet, presses: CalibrationPresses, rows: PopulationRows
 ) -> None:
     plain = rows.inputs[:80]
-    image = plain[:, net.order[:38].numpy()]
+    image = plain[:, net.order[:19].numpy()]
     here = predict(net, net.told(plain, presses))
     there = predict(net, net.told(image, mirrored(net, presses)))
     np.testing.assert_allclose(there, here * net.signs.numpy(), atol=1e-5)
@@ -117,12 +114,12 @@ def test_mirrored_presses_and_rows_get_the_mirrored_estimate(
 def test_no_press_is_the_network_that_knows_none(net: PopulationNet, rows: PopulationRows) -> None:
     nothing = rows.calibration(np.zeros(0, np.int64))
     told = net.told(rows.inputs[:40], nothing)
-    assert not told[:, 38:].any()
+    assert not told[:, 19:].any()
     np.testing.assert_array_equal(predict(net, told), predict(net, rows.inputs[:40]))
 
 
 def test_presses_of_another_shape_are_refused(presses: CalibrationPresses) -> None:
-    with pytest.raises(DatasetError, match=r"inputs .* has shape .*, 37\), not .*, 38\)"):
+    with pytest.raises(DatasetError, match=r"inputs .* has shape .*, 18\), not .*, 19\)"):
         replace(presses, inputs=presses.inputs[:, 1:])
     with pytest.raises(DatasetError, match=r"force .* has shape"):
         replace(presses, force=presses.force[:-1])
@@ -170,12 +167,12 @@ def test_training_tells_no_row_its_own_press(
     monkeypatch.setattr(net, "one_sided", watched)
     numbers = torch.arange(len(episodes.rows)).float()[:, None]
     episodes(numbers)
-    assert not seen[-1][..., 38:].any()
+    assert not seen[-1][..., 19:].any()
     monkeypatch.undo()
     several = population_fit._Episodes(net, rows, np.random.default_rng(0))
     monkeypatch.setattr(net, "one_sided", watched)
     several(torch.arange(32).float()[:, None])
-    assert seen[-1][..., 38:].any()
+    assert seen[-1][..., 19:].any()
 
 
 def test_a_set_with_few_presses_has_a_table_as_far_as_they_go(
@@ -225,16 +222,14 @@ def test_an_estimate_of_a_stiffer_turned_specimen_is_taken_back(
     rows: PopulationRows, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A network that told the stiffness and the turn right would have no error."""
-    config = replace(
-        SMALL, stiffness_sd=0.5, turn_sd=0.3, common_sd=0.0, offset_sd=0.0, rest_sd=0.0
-    )
+    config = replace(SMALL, stiffness_sd=0.5, turn_sd=0.3, common_sd=0.0, offset_sd=0.0)
     net = PopulationNet(("force",), config)
     episodes = population_fit._Episodes(net, rows, np.random.default_rng(0))
     truth = episodes.force[episodes.rows]  # (N, 32, 3)
     drawn: dict[str, torch.Tensor] = {}
 
     def code_of(presses: torch.Tensor) -> torch.Tensor:
-        drawn["force"] = presses[..., 38:41]
+        drawn["force"] = presses[..., 19:22]
         return torch.ones(len(presses), config.code)
 
     def taken(specimen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -328,7 +328,7 @@ def train_population_command(
     ],
     device: Annotated[str, typer.Option(help="Where it is trained: auto, cpu or cuda.")] = "auto",
     seed: Seed = 0,
-    epochs: Annotated[int, typer.Option(min=1, help="Passes over the rows at most.")] = 100,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the rows at most.")] = 60,
     batch_rows: Annotated[int, typer.Option(min=1, help="Rows in one step.")] = 4096,
     width: Annotated[int, typer.Option(min=1, help="Of its layers.")] = 256,
     blocks: Annotated[int, typer.Option(min=1, help="Residual blocks of two layers.")] = 3,
@@ -344,11 +344,11 @@ def train_population_command(
         float,
         typer.Option(
             min=0.0,
-            help="The same of a specimen's forces, which its presses tell.",
+            help="Random factor of a specimen's forces in training, which its presses tell [log].",
         ),
-    ] = 0.0,
+    ] = 0.3,
 ) -> None:
-    """One network for a population, told a specimen by its rest and by presses of it.
+    """One network for a population, told a specimen by presses of it.
 
     It is tested on specimens and presses that it has not met.
 
@@ -370,7 +370,7 @@ def train_population_command(
     for name, cell in facts["cells"].items():
         rivals = [key for key, value in cell.items() if isinstance(value, dict) and key != "shots"]
         table = Table("", *rivals, title=f"{name.replace('_', ' ')}: {cell['presses']} presses")
-        for key in facts["ratio_unseen_to_seen_specimen"]:
+        for key in cell["constant"]:
             table.add_row(key, *(f"{cell[rival].get(key, float('nan')):.3f}" for rival in rivals))
         console.print(table)
         shots = {key: one["network"] for key, one in cell.get("shots", {}).items() if key.isdigit()}

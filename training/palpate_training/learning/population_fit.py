@@ -3,14 +3,14 @@
 Each time that a block is learned from, it gets other presses: none of them, one, or up to ten, and
 never the press that a row belongs to, nor another one at the same point. What is unlike from
 specimen to specimen is drawn for a block as a whole, presses included, so that these tell it: gains
-of its electrodes, what its rest is off by, how stiff its skin is, and whether it is mirrored. What
-passes is drawn for each row, or each press: offsets and noise.
+of its electrodes, how stiff its skin is, and whether it is mirrored. What passes is drawn for each
+row, or each press: offsets and noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -53,7 +53,8 @@ class PopulationRows:
     """Rows to learn from.
 
     Attributes:
-        inputs: As ``inputs_of`` gives them, shape ``(N, 38)``.
+        inputs: As ``inputs_of`` gives them, shape ``(N, 19)``.
+        noise_sd: Standard deviation of their noise, as ``noise_of`` gives it, shape ``(N, 19)``.
         targets: Force [N], then what only a contact has, shape ``(N, 3 Q)``; NaN where there is
             none.
         specimen: Number of each row's specimen, shape ``(N,)``.
@@ -62,6 +63,7 @@ class PopulationRows:
     """
 
     inputs: FloatArray
+    noise_sd: FloatArray
     targets: FloatArray
     specimen: Numbers
     press: Numbers
@@ -74,9 +76,9 @@ class PopulationRows:
 
     def where(self, kept: npt.NDArray[np.bool_]) -> PopulationRows:
         """Some of the rows."""
-        point = None if self.point is None else self.point[kept]
+        known = ((one.name, getattr(self, one.name)) for one in fields(self))
         return PopulationRows(
-            self.inputs[kept], self.targets[kept], self.specimen[kept], self.press[kept], point
+            **{name: None if values is None else values[kept] for name, values in known}
         )
 
     def calibration(self, rows: Numbers) -> CalibrationPresses:
@@ -84,12 +86,19 @@ class PopulationRows:
         return CalibrationPresses(self.inputs[rows], self.targets[rows, :3], self.press[rows])
 
 
+def noise_of(counts: npt.NDArray[np.integer]) -> FloatArray:
+    """Standard deviation of the noise of the logarithm of each impedance, shape of the counts."""
+    share = counts / COUNTS_MAX
+    slope = np.maximum(share * (1.0 - share), 1e-3)
+    return np.asarray(NOISE_COUNTS / COUNTS_MAX / slope, np.float32)
+
+
 @dataclass(frozen=True, slots=True)
 class StopRows:
     """Rows of one specimen to stop on, and presses of it that may be known.
 
     Attributes:
-        inputs: Of the rows, shape ``(N, 38)``.
+        inputs: Of the rows, shape ``(N, 19)``.
         targets: Of the rows, shape ``(N, 3 Q)``.
         presses: None, some, or several sets of them; the scores count alike.
     """
@@ -163,6 +172,7 @@ class _Episodes(nn.Module):
     rows: Tensor
     specimen: Tensor
     inputs: Tensor
+    noise_sd: Tensor
     force: Tensor
     point: Tensor
     trial_rows: Tensor
@@ -181,6 +191,7 @@ class _Episodes(nn.Module):
         ):  # fmt: skip
             self._keep(name, torch.from_numpy(np.asarray(values, np.int64)))
         self._keep("inputs", torch.from_numpy(rows.inputs))
+        self._keep("noise_sd", torch.from_numpy(rows.noise_sd))
         self._keep("force", torch.from_numpy(np.ascontiguousarray(rows.targets[:, :3])))
 
     def _keep(self, name: str, values: Tensor) -> None:
@@ -194,28 +205,29 @@ class _Episodes(nn.Module):
         one = torch.ones(len(block), 1, 1, device=numbers.device)
         electrodes = one.expand(-1, 1, ELECTRODES)
         gain = torch.exp(config.gain_sd * (torch.randn_like(electrodes) + torch.randn_like(one)))
-        rest_off = config.rest_sd * torch.randn_like(electrodes)
         mirrored = torch.rand_like(one) < 0.5
         # Forces of a specimen that was turned, and is stiffer.
         turn = _turns(config.turn_sd * torch.randn(len(block), 3, device=numbers.device))
         stiffness = torch.exp(config.stiffness_sd * torch.randn_like(one))
 
-        def seen(inputs: Tensor, offsets: Tensor) -> Tensor:
-            noisy = _noisy(inputs, offsets, gain, rest_off, config)
+        def seen(rows: Tensor, offsets: Tensor) -> Tensor:
+            inputs = self.inputs[rows]
+            noise = self.noise_sd[rows] * torch.randn_like(inputs)
+            noisy = gain * inputs + noise + offsets
             image = torch.index_select(noisy, -1, net.order[:INPUTS])
             return torch.where(mirrored, image, noisy)
 
         # Offsets last longer than a press.
         of_press = _offsets(used.shape, config, numbers.device)[:, :, None]
         of_press = of_press.expand(*known.shape, ELECTRODES).flatten(1, 2)
-        presses = seen(self.inputs[known].flatten(1, 2), of_press)
+        presses = seen(known.flatten(1, 2), of_press)
         signs = torch.where(mirrored, net.signs[:3], 1.0)
         force = stiffness * (self.force[known].flatten(1, 2) @ turn.mT) * signs
         share = used[:, :, None].expand(known.shape).flatten(1)[..., None] / PRESS_ROWS
         code = net.code_of(torch.cat([presses, force, share], dim=-1))  # (G, C)
         own = (self.point[rows][..., None] == self.point[known[..., 0]][:, None]) & used[:, None]
         told = used.any(dim=1)[:, None, None] & ~own.any(dim=-1, keepdim=True)  # (G, B, 1)
-        inputs = seen(self.inputs[rows], _offsets(rows.shape, config, numbers.device))
+        inputs = seen(rows, _offsets(rows.shape, config, numbers.device))
         inputs = torch.cat([inputs, torch.where(told, code[:, None], 0.0)], dim=-1)
         estimate = net.one_sided(inputs)
         estimate = torch.where(mirrored, estimate * net.signs, estimate)
@@ -255,17 +267,6 @@ def _turns(vectors: Tensor) -> Tensor:
     eye = torch.eye(3, device=vectors.device)
     turns: Tensor = eye + torch.sin(angle) * cross + (1.0 - torch.cos(angle)) * (cross @ cross)
     return turns
-
-
-def _noisy(
-    inputs: Tensor, offsets: Tensor, gain: Tensor, rest_off: Tensor, config: PopulationConfig
-) -> Tensor:
-    """Inputs ``(G, B, 38)`` with noise of the counts, and with what was drawn."""
-    change, rest = inputs.chunk(2, dim=-1)
-    share = torch.sigmoid(-(change + rest))  # counts over full scale
-    noise = NOISE_COUNTS / COUNTS_MAX * torch.randn_like(change)
-    noise = noise / (share * (1.0 - share)).clamp(min=1e-3)
-    return torch.cat([gain * change + noise + offsets, rest + rest_off], dim=-1)
 
 
 def _blocks(specimen: Numbers, rng: np.random.Generator) -> tuple[Numbers, Numbers]:

@@ -1,10 +1,13 @@
-"""One network for all specimens of a population: told which by its rest, and by presses of it.
+"""One network for all specimens of a population, told which by presses of it.
 
 What an electrode reads on touch is the change of the logarithm of its impedance since rest; what
-that means depends on the specimen. Its rest says something about that, and presses with a known
-force say more, as many as there are, also none (``press_set``). So the layers read the change, and
-are modulated by the rest and by the code of the presses (FiLM: a gain and an offset of every hidden
-value); besides, the code multiplies the force by one number.
+that means depends on the specimen, which presses with a known force tell, as many as there are,
+also none (``press_set``). So the layers read the change, and are modulated by the code of the
+presses (FiLM: a gain and an offset of every hidden value); besides, the code multiplies the force
+by one number.
+
+The electrodes at rest are not read: they name a specimen of the training, which is then known by
+heart, and presses count for nothing (training/LOG.md).
 
 A press is read beside what the network makes of it without any: that the forces of a specimen are
 wrong by one factor then lies open.
@@ -42,8 +45,8 @@ FloatArray = npt.NDArray[np.float32]
 WEIGHTS = "population.npz"
 """Where ``palpate train population`` leaves the network in its folder."""
 
-_READ = 2 * (ELECTRODES + 1)
-"""What the layers read of inputs: changes less their mean, that mean, and the same of the rest."""
+_READ = ELECTRODES + 1
+"""What the layers read of inputs: changes less their mean, and that mean."""
 
 _READ_OF_PRESS = _READ + 8
 """What is read of a row of a press: that, the force's direction, the logarithm of its magnitude,
@@ -51,7 +54,7 @@ and by what both differ from the estimate without any press."""
 
 _SMALLEST_SD = 1e-6
 _SMALLEST_N = 0.1
-_FORMAT = "palpate.population-net/2"
+_FORMAT = "palpate.population-net/3"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +64,7 @@ class PopulationConfig(FitConfig):
     Attributes:
         width: Of the residual layers.
         blocks: Residual blocks, of two layers each.
-        rest_width: Hidden values between rest and code, and what they modulate.
+        told_width: Hidden values between the code and what it modulates.
         press_width: Of the layers that read rows of calibration presses.
         code: Values that calibration presses are summed up in.
         common: Share of what the electrodes have in common that is read; with 0 an offset of all
@@ -70,8 +73,6 @@ class PopulationConfig(FitConfig):
         offset_sd: The same of each electrode by itself: tares that are off, electrodes that drift.
         gain_sd: Standard deviation of the logarithm of the gain that all electrodes share, and of
             each's own.
-        rest_sd: The same of what each electrode at rest is off by; keeps specimens of the training
-            from being known by heart.
         stiffness_sd: Standard deviation of the logarithm of the factor of all forces of a specimen
             whose presses are known: a skin as thick but stiffer, which only a press can tell.
         turn_sd: Of such a specimen, standard deviation of the rotation of its forces about each
@@ -79,49 +80,46 @@ class PopulationConfig(FitConfig):
         force_power: Errors of forces count over ``FORCE_FLOOR_N`` plus the magnitude to this power.
     """
 
-    epochs: int = 100
+    epochs: int = 60
     patience: int = 30
     batch_rows: int = 4096
     learning_rate: float = 2e-3
     threads: int = 1
     width: int = 256
     blocks: int = 3
-    rest_width: int = 64
+    told_width: int = 64
     press_width: int = 128
     code: int = 64
     common: float = 1.0
     common_sd: float = 0.03
     offset_sd: float = 0.005
     gain_sd: float = 0.03
-    rest_sd: float = 0.02
-    stiffness_sd: float = 0.0
+    stiffness_sd: float = 0.3
     turn_sd: float = 0.0
     force_power: float = 0.5
 
 
 class _ModulatedLayers(nn.Module):
-    """Residual layers whose normalised values rest and code multiply and move."""
+    """Residual layers whose normalised values a code multiplies and moves."""
 
     def __init__(self, outputs: int, config: PopulationConfig) -> None:
         super().__init__()
-        width, half = config.width, _READ // 2
-        self.first = nn.Linear(half, width)
+        width = config.width
+        self.first = nn.Linear(_READ, width)
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(config.blocks))
         self.blocks = nn.ModuleList(
             nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
             for _ in range(config.blocks)
         )
-        last = nn.Linear(config.rest_width, 2 * width * config.blocks)
+        last = nn.Linear(config.told_width, 2 * width * config.blocks)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
-        known = half + config.code
-        self.specimen = nn.Sequential(nn.Linear(known, config.rest_width), nn.SiLU(), last)
+        self.specimen = nn.Sequential(nn.Linear(config.code, config.told_width), nn.SiLU(), last)
         self.head = nn.Linear(width, outputs)
 
     def forward(self, read: Tensor, code: Tensor) -> Tensor:
-        change, rest = read.chunk(2, dim=-1)
-        hidden = self.first(change)
-        modulation = self.specimen(torch.cat([rest, code], dim=-1))
+        hidden = self.first(read)
+        modulation = self.specimen(code)
         parts = modulation.chunk(2 * len(self.blocks), dim=-1)
         for number, (norm, block) in enumerate(zip(self.norms, self.blocks, strict=True)):
             gain, offset = parts[2 * number : 2 * number + 2]
@@ -131,10 +129,10 @@ class _ModulatedLayers(nn.Module):
 
 
 class PopulationNet(nn.Module):
-    """Changes and rest, and a code, ``(N, 38 + 2 C)`` -> force [N] and more, ``(N, 3 Q)``.
+    """Changes and a code, ``(N, 19 + 2 C)`` -> force [N] and more, ``(N, 3 Q)``.
 
     The code comes from ``told``: of the presses as they are, then of their mirror image. Without
-    one, ``(N, 38)``, the network knows no press.
+    one, ``(N, 19)``, the network knows no press.
 
     The estimate is the mean of that of a row and of its mirror image, the presses mirrored, too: so
     a mirrored row of a specimen whose presses are mirrored gets the mirrored estimate.
@@ -156,9 +154,7 @@ class PopulationNet(nn.Module):
         self.quantities, self.config = tuple(quantities), config
         outputs = 3 * len(self.quantities)
         codes = INPUTS + np.arange(2 * config.code)
-        order = np.concatenate(
-            [ELECTRODE_MIRROR, ELECTRODE_MIRROR + ELECTRODES, np.roll(codes, config.code)]
-        )
+        order = np.concatenate([ELECTRODE_MIRROR, np.roll(codes, config.code)])
         signs = np.tile(MIRROR_AXES, len(self.quantities))
         # Made where the caller's default device is; constants are moved there with the weights.
         self.register_buffer("order", torch.from_numpy(order).long())
@@ -185,25 +181,23 @@ class PopulationNet(nn.Module):
         return nn.functional.pad(inputs, (0, len(self.order) - inputs.shape[-1]))
 
     def one_sided(self, inputs: Tensor) -> Tensor:
-        """Without mirror images, ``(..., 38 + C)`` -> ``(..., O)``: what training sees."""
+        """Without mirror images, ``(..., 19 + C)`` -> ``(..., O)``: what training sees."""
         known, code = inputs[..., :INPUTS], inputs[..., INPUTS:]
         estimate = self.layers(self.read(known), code) * self.output_sd + self.output_mean
         force = estimate[..., :3] * torch.exp(self.factor(code))
         return torch.cat([force, estimate[..., 3:]], dim=-1)
 
     def read(self, inputs: Tensor) -> Tensor:
-        """What the layers read of changes and rest, standardised, shape ``(..., 40)``."""
+        """What the layers read of changes, standardised, shape ``(..., 20)``."""
         return (self.parts(inputs) - self.input_mean) / self.input_sd
 
     def parts(self, inputs: Tensor) -> Tensor:
         """The same before it is standardised."""
-        change, rest = inputs.chunk(2, dim=-1)
-        mean, rest_mean = (part.mean(dim=-1, keepdim=True) for part in (change, rest))
-        common = self.config.common * mean
-        return torch.cat([change - mean, common, rest - rest_mean, rest_mean], dim=-1)
+        mean = inputs.mean(dim=-1, keepdim=True)
+        return torch.cat([inputs - mean, self.config.common * mean], dim=-1)
 
     def code_of(self, presses: Tensor) -> Tensor:
-        """Code of sets of rows ``(..., M, 42)``, shape ``(..., C)``."""
+        """Code of sets of rows ``(..., M, 23)``, shape ``(..., C)``."""
         inputs, force, share = torch.split(presses, [INPUTS, 3, 1], dim=-1)
         with torch.no_grad():
             nothing = nn.functional.pad(inputs, (0, self.config.code))
@@ -216,16 +210,16 @@ class PopulationNet(nn.Module):
         return code
 
     def mirrored_presses(self, presses: Tensor) -> Tensor:
-        """Mirror image of rows of presses, ``(..., 42)``."""
+        """Mirror image of rows of presses, ``(..., 23)``."""
         inputs, force, share = torch.split(presses, [INPUTS, 3, 1], dim=-1)
         mirrored = torch.index_select(inputs, -1, self.order[:INPUTS])
         return torch.cat([mirrored, force * self.signs[:3], share], dim=-1)
 
     def told(self, inputs: FloatArray, presses: CalibrationPresses) -> FloatArray:
-        """Changes and rest ``(N, 38)`` of a specimen beside the code of presses of it.
+        """Changes ``(N, 19)`` of a specimen beside the code of presses of it.
 
         Returns:
-            Shape ``(N, 38 + 2 C)``, for ``predict``.
+            Shape ``(N, 19 + 2 C)``, for ``predict``.
         """
         with torch.inference_mode():
             rows = presses.tensor().to(self.signs.device)
@@ -253,12 +247,12 @@ def _polar(force: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def inputs_of(counts: npt.NDArray[Any], rest: npt.NDArray[Any]) -> FloatArray:
-    """Raw and untouched counts ``(N, 19)`` -> inputs ``(N, 38)``; NumPy, rows by rows the same."""
+    """Raw and untouched counts ``(N, 19)`` -> inputs ``(N, 19)``; NumPy, rows by rows the same."""
     now, untouched = (
         np.log(COUNTS_MAX / np.clip(values.astype(np.float64), 1.0, COUNTS_MAX - 1.0) - 1.0)
         for values in (counts, rest)
     )
-    return np.hstack([now - untouched, untouched]).astype(np.float32)
+    return np.asarray((now - untouched).astype(np.float32))
 
 
 class CountsGraph(nn.Module):
@@ -269,12 +263,13 @@ class CountsGraph(nn.Module):
 
     def __init__(self, net: PopulationNet) -> None:
         super().__init__()
-        self.net = net
+        self.net, self.code = net, 2 * net.config.code
 
     def forward(self, known: Tensor) -> tuple[Tensor]:
         """Estimates, shape ``(N, 3 Q)``."""
-        now, rest = (log_impedance(half) for half in known[:, :INPUTS].chunk(2, dim=-1))
-        return (self.net(torch.cat([now - rest, rest, known[:, INPUTS:]], dim=-1)),)
+        counts, rest, code = torch.split(known, [ELECTRODES, ELECTRODES, self.code], dim=-1)
+        change = log_impedance(counts) - log_impedance(rest)
+        return (self.net(torch.cat([change, code], dim=-1)),)
 
 
 def save_population_net(path: Path, net: PopulationNet) -> None:

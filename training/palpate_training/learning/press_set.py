@@ -20,8 +20,8 @@ from palpate_training.datasets.features import ELECTRODES
 
 FloatArray = npt.NDArray[np.float32]
 
-INPUTS = 2 * ELECTRODES
-"""Changes of the logarithms of the impedance since rest, then these logarithms at rest."""
+INPUTS = ELECTRODES
+"""Changes of the logarithms of the impedance since rest."""
 
 PRESS_COLUMNS = INPUTS + 4
 """Of a row of a press: inputs, force [N], its share of the press: one over its rows, 0 = none."""
@@ -32,7 +32,7 @@ class CalibrationPresses:
     """Presses of one specimen, none or several, whose forces are known.
 
     Attributes:
-        inputs: Changes and rest, as a population's network reads them, shape (M, 38).
+        inputs: Changes since rest, as a population's network reads them, shape (M, 19).
         force: [N], sensor frame, shape (M, 3).
         press: Press of each row, shape (M,).
 
@@ -54,7 +54,7 @@ class CalibrationPresses:
             if np.shape(values) != shape:
                 raise DatasetError(
                     f"{name} of the calibration presses has shape {np.shape(values)}, not {shape}",
-                    remedy="give changes and rest of all electrodes and a force for every row",
+                    remedy="give the changes of all electrodes and a force for every row",
                 )
             if not np.isfinite(values).all():
                 raise DatasetError(
@@ -63,7 +63,7 @@ class CalibrationPresses:
                 )
 
     def tensor(self) -> Tensor:
-        """Rows as the encoder takes them, shape (M, 42)."""
+        """Rows as the encoder takes them, shape (M, 23)."""
         _, number, rows = np.unique(self.press, return_inverse=True, return_counts=True)
         share = 1.0 / rows[number] if len(number) else np.zeros(0)
         return torch.from_numpy(

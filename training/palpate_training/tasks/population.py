@@ -38,6 +38,7 @@ from palpate_training.learning.population_fit import (
     PopulationRows,
     StopRows,
     fit_population,
+    noise_of,
 )
 from palpate_training.learning.population_net import (
     WEIGHTS,
@@ -225,9 +226,8 @@ def train_population(
     """
     where = _device(device)
     data = open_dataset(path)
-    quantities, targets = targets_of(data)
-    inputs = inputs_of(data.electrodes, data.baseline)
-    rows = PopulationRows(inputs, targets, data.sensor, data.group, points_of(data))
+    quantities, rows = rows_of(data)
+    targets = rows.targets
     split = split_population(data, seed=seed)
     begun = time.monotonic()
     with torch.device(where):
@@ -245,8 +245,9 @@ def train_population(
     save_population_net(out / WEIGHTS, net)
     rivals = _rivals(net, rows.inputs, targets, split)
     cells = {name: cell(rows, chosen, net, rivals) for name, chosen in split.cells.items()}
-    for name in ("unseen_specimen_seen_press", "unseen_specimen_unseen_press"):
-        cells[name]["shots"] = shots_table(rows, split.cells[name], net, seed=seed)
+    for name, of_cell in cells.items():
+        if name != "seen_specimen_seen_press":
+            of_cell["shots"] = shots_table(rows, split.cells[name], net, seed=seed)
     facts: dict[str, Any] = {
         "data": data.provenance.source,
         "data_sha256": data.content_sha256(),
@@ -262,11 +263,6 @@ def train_population(
         "device": where,
         "trained_s": round(trained_s, 1),
         "cells": cells,
-        "ratio_unseen_to_seen_specimen": {
-            key: value / cells["seen_specimen_unseen_press"]["network"][key]
-            for key, value in cells["unseen_specimen_unseen_press"]["network"].items()
-            if isinstance(value, float)
-        },
     }
     facts["onnx"] = _export(out / ONNX, net, data, split.cells["unseen_specimen_unseen_press"])
     with written_whole(out / REPORT) as part:
@@ -300,14 +296,18 @@ def _device(wanted: str) -> str:
     return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
 
 
-def targets_of(data: FeatureDataset) -> tuple[tuple[str, ...], FloatArray]:
-    """Names of what a data set knows, and these values, shape ``(N, 3 Q)``; force first."""
+def rows_of(data: FeatureDataset) -> tuple[tuple[str, ...], PopulationRows]:
+    """Names of what a data set knows, force first, and its rows with these values."""
     known = data.arrays()
     names = ("force", *(name for name in OF_CONTACT if name in known))
-    values = np.hstack([np.asarray(known[name], np.float32) for name in names])
+    targets = np.hstack([np.asarray(known[name], np.float32) for name in names])
     if data.in_contact is not None:
-        values[~data.in_contact, 3:] = np.nan
-    return names, values
+        targets[~data.in_contact, 3:] = np.nan
+    rows = PopulationRows(
+        inputs_of(data.electrodes, data.baseline), noise_of(data.electrodes), targets,
+        data.sensor, data.group, points_of(data),
+    )  # fmt: skip
+    return names, rows
 
 
 def _rivals(
