@@ -367,9 +367,10 @@ TOLD = """## What it says
   takes more presses.
 * **A common offset does no harm**: with 0.05 of a logarithm on all electrodes ten presses leave
   {offset:.2f} N.
-* **On real fingers it does not help**: `palpate train transfer --pretrained` is worse with it than
-  without on both fingers (LOG). What touched them is not known; a plate, which is not among the
-  set's indenters, explains them as well as any ([fit to a sensor](twin/sensor-fit.md)).\
+* **On real fingers it does not help** the method for [fingers never met](transfer.md): a quarter of
+  its magnitude makes both fingers worse (LOG). What touched them is not known; a plate, which is
+  not among the set's indenters, explains them as well as any
+  ([fit to a sensor](twin/sensor-fit.md)).\
 """
 
 

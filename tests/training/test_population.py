@@ -16,7 +16,6 @@ from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.errors import BundleError, ConfigError, DatasetError
 from palpate_training.cli import train_app
 from palpate_training.datasets.features import FeatureDataset, write_dataset
-from palpate_training.evaluation.transfer import Finger, fingers_of, summary
 from palpate_training.learning.electrode_nets import MIRROR_AXES
 from palpate_training.learning.networks import predict
 from palpate_training.learning.population_fit import fit_population
@@ -28,7 +27,6 @@ from palpate_training.learning.population_net import (
     load_population_net,
     save_population_net,
 )
-from palpate_training.systems.transfer import ForceTransfer, Pretrained
 from palpate_training.tasks.population import (
     ONNX,
     REPORT,
@@ -161,55 +159,6 @@ def test_the_report_is_there_without_the_graph(
     assert "ONNX Runtime differs" in facts["onnx"]["left out"]
     assert json.loads((tmp_path / REPORT).read_text()) == json.loads(json.dumps(facts))
     assert not (tmp_path / ONNX).exists()
-
-
-def real(data: FeatureDataset, sensor: int) -> Finger:
-    """All rows of one specimen, as if it were a real finger."""
-    (finger,) = (one for one in fingers_of(data) if one.name == data.sensor_names[sensor])
-    return finger
-
-
-def test_a_network_helps_on_a_finger_that_was_never_met(folder: Path, data: FeatureDataset) -> None:
-    source, test = (real(data, sensor) for sensor in (1, 2))
-    net = Pretrained(load_population_net(folder / WEIGHTS))
-    twisted = replace(net, to_real=np.diag([0.5, 0.3, 2.0]))  # undone by what fits the source
-    models = [ForceTransfer([source.recording], one) for one in (None, net, twisted)]
-    plain = models[0].estimate(test.recording, unlabelled=False)
-    assert models[0].helped(test.recording, plain) is plain
-    alone, helped, same = (model.helped(test.recording, plain) for model in models)
-    worst, mine = (
-        summary(force, test.recording.force)["magnitude_median_n"] for force in (alone, helped)
-    )
-    assert mine < 0.95 * worst
-    np.testing.assert_allclose(same, helped, atol=1e-5)
-    there = models[1].helped(test.recording.mirrored(), plain * MIRROR_AXES)
-    np.testing.assert_allclose(there, helped * MIRROR_AXES, atol=1e-4)
-
-
-def test_the_command_takes_a_network_along(
-    folder: Path, data: FeatureDataset, tmp_path: Path
-) -> None:
-    arguments = ["transfer", "--pretrained", str(folder), "--shots", "1", "--json"]
-    for option, sensor in (("--train", 1), ("--test", 2)):
-        rows = np.tile(np.flatnonzero(data.sensor == sensor), 6)
-        none = np.zeros(len(rows), np.int32)
-        one = FeatureDataset(
-            electrodes=data.electrodes[rows],
-            baseline=data.baseline[rows],
-            force=data.force[rows],
-            group=none,
-            block=none,
-            sensor=none,
-            sensor_names=(f"finger-{sensor}",),
-            provenance=data.provenance,
-        )
-        write_dataset(tmp_path / f"{sensor}.h5", one)
-        arguments += [option, str(tmp_path / f"{sensor}.h5")]
-    result = CliRunner().invoke(train_app, arguments, catch_exceptions=False)
-    assert result.exit_code == 0
-    found = json.loads(result.stdout)
-    assert found["pretrained"] is True
-    assert found["magnitude_median_n"] < found["constant"]["magnitude_median_n"]
 
 
 def test_a_population_of_two_is_refused(data: FeatureDataset) -> None:

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tests.training.invented_population import ROWS, SMALL, population
+from tests.training.invented_population import SMALL, population
 
 from palpate.errors import DatasetError
 from palpate_training.datasets.features import FeatureDataset, write_dataset
-from palpate_training.evaluation.transfer import fingers_of
 from palpate_training.learning import population_fit
 from palpate_training.learning.networks import predict
 from palpate_training.learning.population_fit import PopulationRows
@@ -24,7 +23,6 @@ from palpate_training.learning.population_net import (
     load_population_net,
 )
 from palpate_training.learning.press_set import CalibrationPresses
-from palpate_training.systems.transfer import ForceTransfer, LabelledPresses, Pretrained
 from palpate_training.tasks.population import REPORT, rows_of, train_population
 from palpate_training.tasks.population_errors import SHOTS, draw_shots, shots_table
 
@@ -182,32 +180,6 @@ def test_a_set_with_few_presses_has_a_table_as_far_as_they_go(
     table = shots_table(rows, few, net, seed=0)
     assert {int(key) for key in table if key.isdigit()} == {0, 1, 5} < set(SHOTS)
     assert shots_table(rows, rows.press == 5, net, seed=0) == {}
-
-
-def test_a_real_finger_is_told_by_its_presses(folder: Path, data: FeatureDataset) -> None:
-    source, finger = (
-        one.recording for one in fingers_of(data) if one.name in ("unit-004", "unit-009")
-    )
-    touched = np.linalg.norm(finger.force, axis=1) > 0.5
-    known = np.flatnonzero(touched & (np.arange(len(touched)) < 5 * ROWS))
-    labelled = LabelledPresses(known, known // ROWS)
-    net = Pretrained(load_population_net(folder / WEIGHTS))
-    before, after = (np.linalg.norm(net.force(finger, some), axis=1) for some in (None, labelled))
-    truth = np.linalg.norm(finger.force, axis=1)
-    rest = np.setdiff1d(np.flatnonzero(touched), known)
-    wrong, right = (np.median(np.abs(one - truth)[rest]) for one in (before, after))
-    assert right < 0.7 * wrong
-
-    model = ForceTransfer([source], net)
-    plain = model.estimate(finger, unlabelled=False)
-    kept = model.correct(finger, model.helped(finger, plain, labelled), labelled).held_out
-    own = labelled.press == labelled.press[0]
-    wild = finger.force.copy()
-    wild[known[own]] *= 3.0
-    other = replace(finger, force=wild)
-    changed = model.correct(other, model.helped(other, plain, labelled), labelled).held_out
-    np.testing.assert_allclose(changed[own], kept[own], atol=1e-6)
-    assert np.abs(changed[~own] - kept[~own]).max() > 1e-3
 
 
 def test_turns_are_rotations() -> None:

@@ -222,10 +222,6 @@ def train_transfer(
         int, typer.Option(min=1, help="How often the presses are drawn; results are means.")
     ] = 12,
     seed: Annotated[int, typer.Option(help="Of the draws.")] = 0,
-    pretrained: Annotated[
-        Path | None,
-        typer.Option(help="Folder of `palpate train population`, whose network helps."),
-    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
     """Force on a finger that training has not met, and after a few presses of it.
@@ -240,12 +236,6 @@ def train_transfer(
         worst_of,
     )
 
-    helper = None
-    if pretrained is not None:
-        from palpate_training.learning.population_net import WEIGHTS, load_population_net
-        from palpate_training.systems.transfer import Pretrained
-
-        helper = Pretrained(load_population_net(pretrained / WEIGHTS))
     known = [finger for path in train for finger in fingers_of(open_dataset(path))]
     tested = fingers_of(open_dataset(test))
     with _progress(Console(stderr=True)) as progress:
@@ -259,7 +249,6 @@ def train_transfer(
                 unlabelled=shots > 0 if unlabelled is None else unlabelled,
                 draws=draws,
                 seed=seed,
-                pretrained=helper,
                 on_step=lambda: progress.advance(bar),
             )
             for finger in tested

@@ -27,7 +27,6 @@ from palpate_training.systems.transfer import (
     FingerRecording,
     ForceTransfer,
     LabelledPresses,
-    Pretrained,
 )
 
 Floats = npt.NDArray[np.float64]
@@ -108,7 +107,6 @@ def run_transfer(
     unlabelled: bool = False,
     draws: int = 12,
     seed: int = 0,
-    pretrained: Pretrained | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """Fit to some fingers, and measure on another.
@@ -120,7 +118,6 @@ def run_transfer(
         unlabelled: Whether mean and spread of its electrodes may be used.
         draws: How often the labelled presses are drawn; results are means over the draws.
         seed: Of the draws.
-        pretrained: A network of a population that helps; None = none does.
         on_step: Called ``steps_of`` times, for a progress bar.
 
     Returns:
@@ -145,11 +142,9 @@ def run_transfer(
             remedy=f"label at most {len(pieces) - 1}, so that some are left to test",
         )
     sources = [finger.recording for finger in train]
-    width = _width_on_others(train, pretrained, on_step)
+    width = _width_on_others(train, on_step)
     rng = np.random.default_rng(seed)
-    # As much is told of the sources as of the tested finger.
-    told = [_told(source, shots, seed) for source in sources] if pretrained and shots else ()
-    model = ForceTransfer(sources, pretrained, told)
+    model = ForceTransfer(sources)
     on_step()
     plain = model.estimate(test.recording, unlabelled=unlabelled)
     on_step()
@@ -157,11 +152,9 @@ def run_transfer(
     for _ in range(draws if shots else 1):
         labelled, tested = _draw(pieces, shots, test.recording, rng)
         own_width = width
-        if not shots:
-            force = model.helped(test.recording, plain)
-        else:
-            helped = model.helped(test.recording, plain, labelled)
-            corrected = model.correct(test.recording, helped, labelled)
+        force = plain
+        if shots:
+            corrected = model.correct(test.recording, plain, labelled)
             force = corrected.force
             known = test.recording.force[labelled.rows]
             share = shots / (shots + PRESSES_OF_OTHERS)
@@ -191,7 +184,6 @@ def run_transfer(
         "unlabelled": unlabelled,
         "draws": draws if shots else 1,
         "seed": seed,
-        "pretrained": pretrained is not None,
         "rows": len(test.recording.force),
     }
 
@@ -239,20 +231,13 @@ def _draw(
     return LabelledPresses(known, press), np.flatnonzero(tested)
 
 
-def _told(source: FingerRecording, shots: int, seed: int) -> LabelledPresses:
-    pieces = _presses(source)
-    return _draw(pieces, min(shots, len(pieces)), source, np.random.default_rng(seed))[0]
-
-
 def _width(estimate: Floats, truth: Floats) -> float:
     """Half width of the intervals over ``FLOOR_N`` plus the magnitude, from known forces."""
     errors = force_errors(estimate, truth)["magnitude_n"]
     return float(np.quantile(errors / (FLOOR_N + np.linalg.norm(estimate, axis=1)), LEVEL))
 
 
-def _width_on_others(
-    train: Sequence[Finger], pretrained: Pretrained | None, on_step: Callable[[], None]
-) -> float:
+def _width_on_others(train: Sequence[Finger], on_step: Callable[[], None]) -> float:
     """The same from the training fingers: each estimated from the others, or a half from the other.
 
     Halves of one finger know nothing of what differs from finger to finger, so the intervals of one
@@ -269,8 +254,7 @@ def _width_on_others(
         held_out = [([halves[1 - k]], halves[k]) for k in range(2)]
     estimates, truths = [], []
     for sources, tested in held_out:
-        model = ForceTransfer(sources, pretrained)
-        estimates.append(model.helped(tested, model.estimate(tested, unlabelled=False)))
+        estimates.append(ForceTransfer(sources).estimate(tested, unlabelled=False))
         truths.append(tested.force)
         on_step()
     return _width(np.vstack(estimates), np.vstack(truths))

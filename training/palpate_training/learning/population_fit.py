@@ -76,10 +76,9 @@ class PopulationRows:
 
     def where(self, kept: npt.NDArray[np.bool_]) -> PopulationRows:
         """Some of the rows."""
-        known = ((one.name, getattr(self, one.name)) for one in fields(self))
-        return PopulationRows(
-            **{name: None if values is None else values[kept] for name, values in known}
-        )
+        known = {one.name: getattr(self, one.name) for one in fields(self)}
+        some = {name: values[kept] for name, values in known.items() if values is not None}
+        return PopulationRows(**some)
 
     def calibration(self, rows: Numbers) -> CalibrationPresses:
         """Some rows of one specimen, as presses whose forces are known."""

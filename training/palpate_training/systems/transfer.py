@@ -11,8 +11,7 @@ From a finger's electrodes *without* forces comes more about the direction: a re
 spread, electrode by electrode, take the place of the other fingers'. From a few *labelled* presses
 comes a correction that reaches as far as what was pressed, by the common mode, too.
 
-A network of a simulated population may be given, too, and is told the labelled presses: it has a
-share in the magnitude (``Pretrained``). Whether that helps is in training/LOG.md.
+A network of a simulated population helped in no way that was tried (training/LOG.md).
 
 All constants were chosen on the two fingers of the LASA force calibration, in both directions, the
 worse counting, and then frozen (training/LOG.md).
@@ -21,7 +20,7 @@ worse counting, and then frozen (training/LOG.md).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -31,9 +30,6 @@ from scipy.signal import lfilter
 
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
 from palpate_training.learning.electrode_nets import MIRROR_AXES
-from palpate_training.learning.networks import predict
-from palpate_training.learning.population_net import PopulationNet, inputs_of
-from palpate_training.learning.press_set import CalibrationPresses
 from palpate_training.systems.samples import impedance_ohm
 
 Floats = npt.NDArray[np.float64]
@@ -113,9 +109,6 @@ PRESS_VARIANCE_N2 = 0.02
 
 ROW_VARIANCE_N2 = 0.01
 
-HELPED = 0.25
-"""Share of a population's network in the magnitude, where there is one."""
-
 
 @dataclass(frozen=True, slots=True)
 class FingerRecording:
@@ -175,51 +168,6 @@ class LabelledPresses:
 
     rows: npt.NDArray[np.integer]
     press: npt.NDArray[np.integer]
-
-
-@dataclass(frozen=True, slots=True)
-class Pretrained:
-    """A network of a population, and the linear map that takes its forces to those of real fingers.
-
-    Twin and real fingers differ alike for all fingers, by more than specimens of the twin do.
-    """
-
-    net: PopulationNet
-    to_real: Floats = field(default_factory=lambda: np.eye(3))
-
-    def fitted(
-        self, sources: Sequence[FingerRecording], labelled: Sequence[LabelledPresses | None]
-    ) -> Pretrained:
-        """The same with the map that fits recordings with their forces, and their mirror images.
-
-        Args:
-            sources: The recordings.
-            labelled: What the network is told of each: as much as of the finger that is tested.
-        """
-        told = zip(sources, labelled, strict=True)
-        guess = np.vstack([self.force(source, presses) for source, presses in told])
-        force = np.vstack([source.force for source in sources])
-        guesses, forces = (np.vstack([one, one * MIRROR_AXES]) for one in (guess, force))
-        fit = np.linalg.lstsq(guesses, forces, rcond=None)[0]
-        return replace(self, to_real=self.to_real @ fit)
-
-    def force(
-        self,
-        recording: FingerRecording,
-        labelled: LabelledPresses | None,
-        rows: npt.NDArray[np.integer] | slice = slice(None),
-    ) -> Floats:
-        """Forces of some rows of a finger [N], after presses of it."""
-        inputs = inputs_of(recording.electrodes[rows], recording.baseline[rows])
-        if labelled is not None:
-            own = labelled.rows
-            presses = CalibrationPresses(
-                inputs_of(recording.electrodes[own], recording.baseline[own]),
-                recording.force[own],
-                labelled.press,
-            )
-            inputs = self.net.told(inputs, presses)
-        return np.asarray(predict(self.net, inputs)[:, :3].astype(np.float64) @ self.to_real)
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,21 +252,8 @@ class CorrectedForces:
 class ForceTransfer:
     """Estimates forces on fingers that are not among those it was fitted to."""
 
-    def __init__(
-        self,
-        sources: Sequence[FingerRecording],
-        pretrained: Pretrained | None = None,
-        told: Sequence[LabelledPresses | None] = (),
-    ) -> None:
-        """Fit to recordings of other fingers, with their forces.
-
-        Args:
-            sources: The recordings.
-            pretrained: A network that helps.
-            told: What it is told of each; empty = of none anything.
-        """
-        told = told or [None for _ in sources]
-        self._helper = None if pretrained is None else pretrained.fitted(sources, told)
+    def __init__(self, sources: Sequence[FingerRecording]) -> None:
+        """Fit to recordings of other fingers, with their forces."""
         self._sources = sources
         self._scale = _Scale.shared(sources, CORRECTION_INPUTS)
         # Some estimate both magnitude and direction.
@@ -347,22 +282,6 @@ class ForceTransfer:
         lengths = [np.linalg.norm(forces[each], axis=1) for each in MAGNITUDE]
         return np.asarray(np.mean(lengths, axis=0)[:, None] * direction)
 
-    def helped(
-        self, recording: FingerRecording, estimate: Floats, labelled: LabelledPresses | None = None
-    ) -> Floats:
-        """Estimates of all rows with the network's share in their magnitude, if there is one.
-
-        Args:
-            recording: With the forces of the labelled rows; no others are looked at.
-            estimate: Of all its rows [N], shape (N, 3).
-            labelled: What the network is told.
-        """
-        if self._helper is None:
-            return estimate
-        helped = np.linalg.norm(self._helper.force(recording, labelled), axis=1)
-        length = np.linalg.norm(estimate, axis=1)
-        return np.asarray(_unit(estimate) * ((1.0 - HELPED) * length + HELPED * helped)[:, None])
-
     def correct(
         self, recording: FingerRecording, estimate: Floats, labelled: LabelledPresses
     ) -> CorrectedForces:
@@ -370,7 +289,7 @@ class ForceTransfer:
 
         Args:
             recording: With the forces of the labelled rows; no others are looked at.
-            estimate: Of all its rows [N], as ``helped`` has them, shape (N, 3).
+            estimate: Of all its rows [N], shape (N, 3).
             labelled: Which rows.
         """
         everything = np.arange(len(estimate))
@@ -394,29 +313,9 @@ class ForceTransfer:
         held_out = np.empty_like(error)
         for press in np.unique(labelled.press):
             own = labelled.press == press
-            without = self._without(recording, estimate[labelled.rows], labelled, own)
-            weight = inverse @ (recording.force[labelled.rows] - without)
             left = np.linalg.solve(inverse[np.ix_(own, own)], weight[own])
             held_out[own] = recording.force[labelled.rows[own]] - left
         return CorrectedForces(force, held_out)
-
-    def _without(
-        self,
-        recording: FingerRecording,
-        estimate: Floats,
-        labelled: LabelledPresses,
-        own: npt.NDArray[np.bool_],
-    ) -> Floats:
-        """Estimates of the labelled rows (M, 3), had a network not been told some of them."""
-        if self._helper is None:
-            return estimate
-        others = LabelledPresses(labelled.rows[~own], labelled.press[~own])
-        told, less = (
-            np.linalg.norm(self._helper.force(recording, some, labelled.rows), axis=1)
-            for some in (labelled, others)
-        )
-        length = np.linalg.norm(estimate, axis=1) + HELPED * (less - told)
-        return np.asarray(_unit(estimate) * length[:, None])
 
 
 def _mean_direction(forces: Sequence[Floats]) -> Floats:
