@@ -34,7 +34,9 @@ from palpate_training.datasets.ingest import (
 from palpate_training.datasets.inspect import ExperimentContents, load
 from palpate_training.datasets.inspect import contents as experiment_contents
 from palpate_training.datasets.join import join_files
+from palpate_training.datasets.lerobot import export_lerobot, read_lerobot
 from palpate_training.datasets.shrink import SMALL, SmallSize, shrink_file
+from palpate_training.datasets.tables import ColumnMap, dataset_of, export_table, read_table
 from palpate_training.datasets.trials import TRIALS_SCHEMA
 
 console = Console()
@@ -119,6 +121,46 @@ def data_inspect(
     show(as_json, lambda: asdict(found), lambda: experiment_table(found, str(path)))
 
 
+def data_import(
+    source: Annotated[
+        Path, typer.Argument(metavar="TABLE", help="CSV, Parquet, or folder of a LeRobotDataset.")
+    ],
+    out: Annotated[Path, typer.Argument(help="Data set to write (.h5).")],
+    columns: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MAP.toml", help="Which columns are what; none = palpate's own names."
+        ),
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="Name of the BioTac, if no column says it.")
+    ] = None,
+    licence: Annotated[
+        str, typer.Option(help="What may be done with the rows; kept with them.")
+    ] = "own table",
+    drop_incomplete: Annotated[
+        bool, typer.Option("--drop-incomplete", help="Leave rows out that lack a number.")
+    ] = False,
+) -> None:
+    """Table with named columns -> data set.
+
+    palpate data import presses.csv presses.h5 --columns map.toml
+    """
+    table = read_lerobot(source) if source.is_dir() else read_table(source)
+    found = ColumnMap.read(columns) if columns else ColumnMap.ours(table.column_names)
+    data = dataset_of(
+        table,
+        found,
+        source=source,
+        sensor=sensor,
+        licence=licence,
+        command=typed_command(),
+        drop_incomplete=drop_incomplete,
+    )
+    write_dataset(out, data)
+    console.print(contents(data, str(out)))
+
+
 def data_export(
     path: DataArgument,
     out: Annotated[Path, typer.Argument(help="Folder or file to write; must not exist.")],
@@ -126,19 +168,46 @@ def data_export(
         bool, typer.Option("--published", help="Folder with biotac1.hdf5 and so on.")
     ] = False,
     csv: Annotated[bool, typer.Option("--csv", help="One table of text.")] = False,
+    parquet: Annotated[bool, typer.Option("--parquet", help="One Parquet file.")] = False,
+    lerobot: Annotated[bool, typer.Option("--lerobot", help="Folder of a LeRobotDataset.")] = False,
+    fps: Annotated[
+        float | None,
+        typer.Option(min=1e-3, help="--lerobot: rows a second; none = what their times say."),
+    ] = None,
 ) -> None:
-    """Data set of an experiment -> published layout, or CSV.
+    """Data set -> files for others.
 
-    palpate data export twin.h5 twin.csv --csv
+    That of an experiment: --published or --csv. Rows of features: --csv, --parquet or --lerobot.
+
+    palpate data export presses.h5 presses.parquet --parquet
     """
-    if published == csv:
-        raise ConfigError("give one of --published and --csv", remedy="see palpate data export -h")
-    _, data = load(path)
-    if csv:
-        console.print(f"wrote {out}: {export_csv(out, data)} rows")
+    if published + csv + parquet + lerobot != 1:
+        raise ConfigError(
+            "give one of --published, --csv, --parquet and --lerobot",
+            remedy="see palpate data export --help",
+        )
+    schema = schema_of(path, extra="training") if path.is_file() else ""
+    rows = schema == FEATURES_SCHEMA.name
+    if published if rows else parquet or lerobot:
+        raise ConfigError(
+            f"{path} cannot be exported in that form",
+            remedy="--published is of experiments; make rows for the other forms first: "
+            "palpate data features",
+        )
+    if not rows:
+        _, experiment = load(path)
+        if csv:
+            console.print(f"wrote {out}: {export_csv(out, experiment)} rows")
+        else:
+            for file in export_published(out, experiment):
+                console.print(f"wrote {file}")
+        return
+    data = open_dataset(path)
+    if lerobot:
+        console.print(f"wrote {out}: {export_lerobot(out, data, fps=fps)} episodes")
     else:
-        for file in export_published(out, data):
-            console.print(f"wrote {file}")
+        export_table(out, data, csv=csv)
+        console.print(f"wrote {out}: {len(data)} rows")
 
 
 def data_features(

@@ -70,7 +70,7 @@ def export_published(folder: Path, data: ExperimentDataset | MixedDataset) -> li
                 _write_simulated(h5, simulated, data, trials)
                 names.append(simulated.name)
 
-    _whole(folder, write)
+    written_new(folder, write)
     return [folder / name for name in names]
 
 
@@ -105,7 +105,7 @@ def export_csv(path: Path, data: ExperimentDataset | MixedDataset) -> int:
                     ]
                 )
 
-    _whole(path, write)
+    written_new(path, write)
     return len(rows)
 
 
@@ -116,8 +116,12 @@ def _numbers(unit_names: tuple[str, ...]) -> list[int]:
     return numbers if whole else list(range(1, len(unit_names) + 1))
 
 
-def _whole(path: Path, write: Callable[[Path], None]) -> None:
-    """Write a file or folder beside its place, then move it there."""
+def written_new(path: Path, write: Callable[[Path], None]) -> None:
+    """Write a file or folder beside its place, then move it there.
+
+    Raises:
+        DatasetError: It exists, or the disk refused.
+    """
     if path.exists():
         raise DatasetError(f"{path} exists", remedy="remove it, or give another name")
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")

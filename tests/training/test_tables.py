@@ -1,0 +1,260 @@
+"""Tables with named columns, and LeRobotDatasets: there and back, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from tests.training.invented_population import population
+from typer.testing import CliRunner
+
+from palpate.errors import ConfigError, DatasetError
+from palpate_training.cli import data_app
+from palpate_training.datasets.features import FeatureDataset, open_dataset, write_dataset
+from palpate_training.datasets.lerobot import export_lerobot, read_lerobot
+from palpate_training.datasets.tables import (
+    ColumnMap,
+    columns_of,
+    dataset_of,
+    export_table,
+    read_table,
+    table_of,
+)
+
+STEP_NS = 10_000_000
+
+
+@pytest.fixture(scope="module")
+def data() -> FeatureDataset:
+    known = population(specimens=3, presses=6, each=2)
+    order = np.lexsort((np.arange(len(known)), known.group, known.sensor))
+    arrays = {name: array[order] for name, array in known.arrays().items()}
+    arrays["time_ns"] = np.arange(len(known), dtype=np.int64) * STEP_NS + 10**18
+    return FeatureDataset(
+        **arrays,
+        sensor_names=known.sensor_names,
+        provenance=replace(known.provenance, source="invented", licence="free"),
+    )
+
+
+@pytest.mark.parametrize("csv", [True, False])
+def test_a_table_comes_back_as_it_was(data: FeatureDataset, tmp_path: Path, csv: bool) -> None:
+    path = tmp_path / ("rows.csv" if csv else "rows.parquet")
+    export_table(path, data, csv=csv)
+    table = read_table(path)
+    back = dataset_of(table, ColumnMap.ours(table.column_names), source=path)
+    assert back.sensor_names == data.sensor_names
+    for name, array in data.arrays().items():
+        if name not in ("group", "block"):
+            np.testing.assert_array_equal(getattr(back, name), array, err_msg=name)
+    pairs = np.stack([data.group, data.sensor, back.group])
+    assert len(np.unique(pairs, axis=1).T) == len(np.unique(back.group))
+    with pytest.raises(DatasetError, match="exists"):
+        export_table(path, data, csv=csv)
+
+
+def test_a_strangers_table_is_read_by_a_map(data: FeatureDataset, tmp_path: Path) -> None:
+    count = len(data)
+    force = data.force.astype(np.float64)
+    table = pa.table(
+        {
+            "t": np.arange(count) * 0.01,
+            "skin": [row.tolist() for row in data.electrodes],
+            "Fy": 1e3 * force[:, 1],
+            "Fx": 1e3 * force[:, 0],
+            "up": -1e3 * force[:, 2],
+            "episode": data.group,
+        }
+    )
+    (tmp_path / "map.toml").write_text(
+        'electrodes = "skin"\nrest_rows = 5\nforce = ["Fx", "Fy", "-up"]\nforce_unit = "mN"\n'
+        'time = "t"\ngroup = "episode"\n'
+    )
+    pq.write_table(table, tmp_path / "lab.parquet")
+    arguments = ["import", str(tmp_path / "lab.parquet"), str(tmp_path / "lab.h5")]
+    arguments += ["--columns", str(tmp_path / "map.toml"), "--sensor", "left", "--licence", "CC0"]
+    result = CliRunner().invoke(data_app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    back = open_dataset(tmp_path / "lab.h5")
+    np.testing.assert_allclose(back.force, data.force, atol=1e-5)
+    np.testing.assert_array_equal(back.electrodes, data.electrodes)
+    np.testing.assert_allclose(back.baseline[0], data.electrodes[:5].mean(axis=0), rtol=1e-6)
+    assert back.sensor_names == ("left",)
+    assert back.provenance.licence == "CC0"
+    assert back.time_ns is not None
+    assert set(np.diff(back.time_ns)) == {STEP_NS}
+    same = back.group[:, None] == back.group
+    np.testing.assert_array_equal(same, data.group[:, None] == data.group)
+
+
+def test_without_groups_a_file_is_cut_into_blocks(data: FeatureDataset) -> None:
+    table = table_of(data).drop_columns(["group", "sensor"])
+    back = dataset_of(table, ColumnMap.ours(table.column_names), source=Path("x.csv"))
+    assert len(np.unique(back.block)) == 20
+    assert len(np.unique(back.group)) == 1
+    assert (np.diff(back.block) >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda rows: rows.drop_columns(["electrode_7"]), "no column 'electrode_7'"),
+        (lambda rows: rows.drop_columns(columns_of("baseline")), "untouched"),
+        (lambda rows: put(rows, "electrode_3", 17.5), r"E3 reads 17\.5 in row 4"),
+        (lambda rows: put(rows, "electrode_3", 4096.0), r"E3 reads 4096 in row 4"),
+        (lambda rows: put(rows, "electrode_3", float("nan")), "electrodes is not known in row 4"),
+        (lambda rows: put(rows, "force_z_n", float("inf")), "force is not known in row 4"),
+        (lambda rows: put(rows, "in_contact", 3.0), "'in_contact' holds 3 in row 4"),
+        (lambda rows: put(rows, "force_x_n", "much"), "'force_x_n' holds string"),
+        (lambda rows: rows.slice(0, 0), "no rows"),
+    ],
+)
+def test_a_wrong_table_is_refused(data: FeatureDataset, change: object, says: str) -> None:
+    table = change(table_of(data))  # type: ignore[operator]
+    with pytest.raises(DatasetError, match=says):
+        dataset_of(table, ColumnMap.ours(table.column_names), source=Path("lab.csv"))
+
+
+def put(table: pa.Table, name: str, value: object) -> pa.Table:
+    """A table with another value in row 4 of one column."""
+    values = table.column(name).to_pylist()
+    if isinstance(value, str):
+        values = [str(one) for one in values]
+    else:
+        values = [float(one) for one in values]
+    values[4] = value
+    return table.set_column(table.column_names.index(name), name, pa.array(values))
+
+
+def test_incomplete_rows_are_left_out_only_if_that_is_said(data: FeatureDataset) -> None:
+    table = put(table_of(data), "force_z_n", float("nan"))
+    found = dataset_of(
+        table, ColumnMap.ours(table.column_names), source=Path("x"), drop_incomplete=True
+    )
+    assert len(found) == len(data) - 1
+    assert "1 incomplete rows left out" in found.provenance.notes
+
+
+def test_lists_of_another_width_are_refused(data: FeatureDataset) -> None:
+    skin = [row.tolist() for row in data.electrodes]
+    skin[3] = skin[3][:-1]
+    table = table_of(data).append_column("skin", pa.array(skin))
+    columns = ColumnMap(electrodes="skin", force=columns_of("force"), rest_rows=3)
+    with pytest.raises(DatasetError, match=r"'skin' holds 18 numbers in row 3, not 19"):
+        dataset_of(table, columns, source=Path("x"))
+    short = columns.model_copy(update={"electrodes": ["electrode_1", "electrode_2"]})
+    with pytest.raises(DatasetError, match=r"2 columns are named from 'electrode_1' on, not 19"):
+        dataset_of(table, short, source=Path("x"))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("electrodes = 3\nforce = 'f'", "electrodes"),
+        ("electrodes = 'e'", "force"),
+        ("electrodes = 'e'\nforce = 'f'\nvoltage = 'v'", "voltage"),
+        ("electrodes = 'e'\nforce = 'f'\ntime_unit = 'h'", "time_unit"),
+        ("electrodes = ", "map.toml"),
+    ],
+)
+def test_a_wrong_map_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "map.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=says):
+        ColumnMap.read(path)
+
+
+def test_what_is_no_table_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "rows.parquet").write_bytes(b"\x00\x01")
+    (tmp_path / "empty.csv").write_bytes(b"")
+    (tmp_path / "rows.csv").write_text("time\n1.0\n")
+    for name in ("rows.parquet", "empty.csv", "none.csv", "none.parquet"):
+        with pytest.raises(DatasetError, match="cannot be read"):
+            read_table(tmp_path / name)
+    table = read_table(tmp_path / "rows.csv")
+    with pytest.raises(DatasetError, match="no column 'electrode_1'"):
+        dataset_of(table, ColumnMap.ours(table.column_names), source=tmp_path / "rows.csv")
+
+
+def test_a_lerobot_dataset_has_episodes_at_an_even_rate(
+    data: FeatureDataset, tmp_path: Path
+) -> None:
+    assert data.time_ns is not None
+    times = data.time_ns.copy()
+    times[4:] += 3 * STEP_NS  # three rows are missing in the first press
+    gapped = replace(data, time_ns=times)
+    presses = len(np.unique(np.stack([data.group, data.sensor]), axis=1).T)
+    assert export_lerobot(tmp_path / "set", gapped) == presses + 1
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    assert info["fps"] == 100
+    assert info["total_frames"] == len(data)
+    table = read_lerobot(tmp_path / "set")
+    frame, episode, time_s = (
+        table.column(name).to_numpy() for name in ("frame_index", "episode_index", "timestamp")
+    )
+    np.testing.assert_allclose(time_s, frame / 100.0, atol=1e-4)
+    assert list(episode[:6]) == [0, 0, 0, 0, 1, 1]
+    stats = json.loads((tmp_path / "set/meta/stats.json").read_text())
+    np.testing.assert_allclose(
+        stats["observation.force"]["mean"], data.force.mean(axis=0), atol=1e-6
+    )
+    columns = ColumnMap(
+        electrodes="observation.electrodes",
+        rest="observation.electrodes_at_rest",
+        force="observation.force",
+        contact_location="observation.contact_location",
+        time="time_ns",
+        time_unit="ns",
+        group="episode_index",
+    )
+    back = dataset_of(table, columns, source=tmp_path / "set")
+    np.testing.assert_array_equal(back.electrodes, data.electrodes)
+    np.testing.assert_array_equal(back.time_ns, times)
+    with pytest.raises(DatasetError, match="exists"):
+        export_lerobot(tmp_path / "set", data)
+
+
+def test_a_lerobot_dataset_needs_a_rate(data: FeatureDataset, tmp_path: Path) -> None:
+    timeless = replace(data, time_ns=None)
+    with pytest.raises(DatasetError, match="--fps"):
+        export_lerobot(tmp_path / "set", timeless)
+    assert not list(tmp_path.iterdir())
+    export_lerobot(tmp_path / "set", timeless, fps=50.0)
+    assert json.loads((tmp_path / "set/meta/info.json").read_text())["fps"] == 50
+
+
+def test_a_lerobot_dataset_of_which_a_file_is_missing_is_refused(
+    data: FeatureDataset, tmp_path: Path
+) -> None:
+    with pytest.raises(DatasetError, match="no LeRobotDataset"):
+        read_lerobot(tmp_path)
+    export_lerobot(tmp_path / "set", data)
+    (tmp_path / "set/data/chunk-000/file-000.parquet").unlink()
+    with pytest.raises(DatasetError, match="0 files hold 0 rows"):
+        read_lerobot(tmp_path / "set")
+    place = tmp_path / "set/meta/info.json"
+    place.write_text(place.read_text().replace("v3.0", "v1.6"))
+    with pytest.raises(DatasetError, match=r"v1\.6"):
+        read_lerobot(tmp_path / "set")
+
+
+def test_the_command_writes_each_form(data: FeatureDataset, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "rows.h5", data)
+    for form, name in (("--csv", "a.csv"), ("--parquet", "a.parquet"), ("--lerobot", "a")):
+        arguments = ["export", str(tmp_path / "rows.h5"), str(tmp_path / name), form]
+        result = CliRunner().invoke(data_app, arguments, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        assert (tmp_path / name).exists()
+        back = ["import", str(tmp_path / name), str(tmp_path / f"{name}.h5")]
+        if form != "--lerobot":
+            result = CliRunner().invoke(data_app, back, catch_exceptions=False)
+            assert result.exit_code == 0, result.output
+    for wrong in (["--published"], [], ["--csv", "--lerobot"]):
+        arguments = ["export", str(tmp_path / "rows.h5"), str(tmp_path / "b"), *wrong]
+        with pytest.raises(ConfigError):
+            CliRunner().invoke(data_app, arguments, catch_exceptions=False)

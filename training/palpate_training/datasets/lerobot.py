@@ -1,0 +1,251 @@
+"""Rows of features as a LeRobotDataset, and a LeRobotDataset as a table.
+
+Written is version 3.0 of that format: ``data/chunk-000/file-000.parquet`` with a list of numbers
+for each feature, ``meta/info.json``, ``meta/stats.json``, ``meta/tasks.parquet`` and
+``meta/episodes/chunk-000/file-000.parquet``. There is no video. Read are all Parquet files of
+versions 2 and 3, in order.
+
+An episode is a run of rows of one press at an even rate: LeRobot computes times from the number of
+a frame, and refuses others. The true time of a row stays in the feature ``time_ns``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate.process import require
+from palpate_training.datasets.export import written_new
+from palpate_training.datasets.features import ELECTRODES, FeatureDataset
+from palpate_training.datasets.tables import read_table
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+VERSION = "v3.0"
+TASK = "press the finger"
+
+FEATURES = {
+    "electrodes": "observation.electrodes",
+    "baseline": "observation.electrodes_at_rest",
+    "force": "observation.force",
+    "contact_location": "observation.contact_location",
+    "centre_of_pressure": "observation.centre_of_pressure",
+    "contact_normal": "observation.contact_normal",
+}
+"""Names of the features, by our arrays; all are float32."""
+
+_NAMES = {ELECTRODES: [f"E{number + 1}" for number in range(ELECTRODES)], 3: list("xyz")}
+_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_STEP_TOLERANCE = 0.5
+"""Share of a step by which the next row may be early or late."""
+
+Ints = npt.NDArray[np.int64]
+
+
+def export_lerobot(folder: Path, data: FeatureDataset, *, fps: float | None = None) -> int:
+    """Write a folder, complete or not at all; returns the number of episodes.
+
+    Args:
+        folder: Must not exist.
+        data: Rows; where nothing touches, what only a contact has is NaN.
+        fps: Rows a second; None = what the rows' times say.
+
+    Raises:
+        DatasetError: The folder exists, the rows have no times and no rate is given, or the disk
+            refused.
+        MissingExtraError: pyarrow is not installed.
+    """
+    arrow = require("pyarrow", extra="training")
+    import pyarrow.parquet as parquet
+
+    rate = _rate(data) if fps is None else float(fps)
+    episode = _episodes(data, rate)
+    starts = np.flatnonzero(np.diff(episode, prepend=-1))
+    lengths = np.diff(np.append(starts, len(data)))
+    frame = np.arange(len(data)) - np.repeat(starts, lengths)
+    known = data.arrays()
+    lists = {FEATURES[name]: known[name].astype(np.float32) for name in FEATURES if name in known}
+    plain: dict[str, npt.NDArray[Any]] = {
+        "timestamp": (frame / rate).astype(np.float32),
+        "frame_index": frame.astype(np.int64),
+        "episode_index": episode,
+        "index": np.arange(len(data), dtype=np.int64),
+        "task_index": np.zeros(len(data), np.int64),
+    }
+    if data.time_ns is not None:
+        plain["time_ns"] = data.time_ns
+    columns = {name: _lists(arrow, values) for name, values in lists.items()} | plain
+    stats = {name: _statistics(values) for name, values in (lists | plain).items()}
+
+    def write(part: Path) -> None:
+        place = part / _DATA.format(chunk_index=0, file_index=0)
+        meta = part / "meta"
+        for one in (place.parent, meta / "episodes/chunk-000"):
+            one.mkdir(parents=True)
+        parquet.write_table(arrow.table(columns), place, compression="zstd")
+        parquet.write_table(_tasks(arrow), meta / "tasks.parquet")
+        parquet.write_table(
+            arrow.table(_episode_rows(starts, lengths)),
+            meta / "episodes/chunk-000/file-000.parquet",
+        )
+        _write_json(meta / "stats.json", stats)
+        _write_json(meta / "info.json", _info(data, rate, lists, plain, len(starts)))
+
+    written_new(folder, write)
+    return len(starts)
+
+
+def read_lerobot(folder: Path) -> pa.Table:
+    """All rows of a LeRobotDataset of version 2 or 3.
+
+    Raises:
+        DatasetError: It is none, or its files do not hold the rows that it says.
+        MissingExtraError: pyarrow is not installed.
+    """
+    arrow = require("pyarrow", extra="training")
+    place = folder / "meta/info.json"
+    try:
+        info = json.loads(place.read_text(encoding="utf-8"))
+        version, frames = str(info["codebase_version"]), int(info["total_frames"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(
+            f"{folder} is no LeRobotDataset: {place.name}: {error}",
+            remedy="give the folder that holds meta/info.json",
+        ) from error
+    if version.split(".")[0] not in ("v2", "v3"):
+        raise DatasetError(
+            f"{folder} is of version {version}", remedy="convert it to v2 or v3 with LeRobot"
+        )
+    files = sorted((folder / "data").glob("chunk-*/*.parquet"))
+    tables = [read_table(file) for file in files]
+    rows = sum(table.num_rows for table in tables)
+    if rows != frames:
+        raise DatasetError(
+            f"{folder}: {len(files)} files hold {rows} rows, {place.name} says {frames}",
+            remedy="fetch the whole data set, with its large files",
+        )
+    try:
+        return arrow.concat_tables(tables)
+    except arrow.ArrowException as error:
+        raise DatasetError(
+            f"{folder}: its files have different columns: {error}", remedy="fetch it again"
+        ) from error
+
+
+def _rate(data: FeatureDataset) -> float:
+    if data.time_ns is None:
+        raise DatasetError(
+            f"{data.name}: rows have no times", remedy="say how many there are a second: --fps"
+        )
+    same = (np.diff(data.group) == 0) & (np.diff(data.sensor) == 0)
+    steps = np.diff(data.time_ns)[same]
+    steps = steps[steps > 0]
+    if not len(steps):
+        raise DatasetError(
+            f"{data.name}: no press has two rows with times that rise",
+            remedy="say how many rows there are a second: --fps",
+        )
+    # Rounded to what people call such a rate: 100 and not 99.998 a second.
+    return float(f"{1e9 / float(np.median(steps)):.4g}")
+
+
+def _episodes(data: FeatureDataset, rate: float) -> Ints:
+    """Number of each row's episode: it ends with a press, a sensor, and where a row is missing."""
+    new = (np.diff(data.group) != 0) | (np.diff(data.sensor) != 0)
+    if data.time_ns is not None:
+        new |= np.abs(np.diff(data.time_ns) * 1e-9 * rate - 1.0) > _STEP_TOLERANCE
+    return np.concatenate([[0], np.cumsum(new)]).astype(np.int64)
+
+
+def _lists(arrow: Any, values: npt.NDArray[np.float32]) -> Any:
+    flat = arrow.array(np.ascontiguousarray(values).reshape(-1))
+    return arrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
+
+
+def _tasks(arrow: Any) -> Any:
+    """The one task; pandas, which LeRobot reads it with, finds its name in the index."""
+    index = {
+        "index_columns": ["task"],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64",
+             "numpy_type": "int64", "metadata": None},
+            {"name": "task", "field_name": "task", "pandas_type": "unicode",
+             "numpy_type": "object", "metadata": None},
+        ],
+        "column_indexes": [],
+    }  # fmt: skip
+    table = arrow.table({"task_index": np.zeros(1, np.int64), "task": [TASK]})
+    return table.replace_schema_metadata({b"pandas": json.dumps(index).encode()})
+
+
+def _episode_rows(starts: Ints, lengths: Ints) -> dict[str, Any]:
+    none = np.zeros(len(starts), np.int64)
+    return {
+        "episode_index": np.arange(len(starts), dtype=np.int64),
+        "tasks": [[TASK] for _ in starts],
+        "length": lengths,
+        "data/chunk_index": none,
+        "data/file_index": none,
+        "dataset_from_index": starts,
+        "dataset_to_index": starts + lengths,
+        "meta/episodes/chunk_index": none,
+        "meta/episodes/file_index": none,
+    }
+
+
+def _statistics(values: npt.NDArray[Any]) -> dict[str, list[float]]:
+    """Least, largest, mean and spread of each number, where it is known."""
+    rows = values.reshape(len(values), -1).astype(np.float64)
+    known = rows[np.isfinite(rows).all(axis=1)]
+    some = known if len(known) else np.zeros((1, rows.shape[1]))
+    return {
+        "min": some.min(axis=0).tolist(),
+        "max": some.max(axis=0).tolist(),
+        "mean": some.mean(axis=0).tolist(),
+        "std": some.std(axis=0).tolist(),
+        "count": [len(known)],
+    }
+
+
+def _info(
+    data: FeatureDataset,
+    rate: float,
+    lists: Mapping[str, npt.NDArray[Any]],
+    plain: Mapping[str, npt.NDArray[Any]],
+    episodes: int,
+) -> dict[str, Any]:
+    features = {
+        name: {"dtype": "float32", "shape": [values.shape[1]], "names": _NAMES[values.shape[1]]}
+        for name, values in lists.items()
+    } | {
+        name: {"dtype": str(values.dtype), "shape": [1], "names": None}
+        for name, values in plain.items()
+    }
+    return {
+        "codebase_version": VERSION,
+        "robot_type": "biotac",
+        "total_episodes": episodes,
+        "total_frames": len(data),
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": int(rate) if float(rate).is_integer() else rate,
+        "splits": {"train": f"0:{episodes}"},
+        "data_path": _DATA,
+        "video_path": None,
+        "features": features,
+        "palpate": {"sensors": data.sensor_names, "provenance": asdict(data.provenance)},
+    }
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,426 @@
+"""Rows of features as a table with named columns, and tables of others as rows of features.
+
+A table is CSV, Parquet, or the folder of a LeRobotDataset (``lerobot``). Ours has a column for each
+number, with its unit in the name: ``electrode_1`` to ``electrode_19``, ``rest_1``, ...,
+``force_x_n``, ..., ``time_ns``, ``sensor``. A table of somebody else is read by a map that says
+which columns are what.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from palpate import __version__
+from palpate.errors import ConfigError, DatasetError
+from palpate.messages import COUNTS_MAX
+from palpate.process import require
+from palpate_training.datasets.container import Provenance, sha256_of
+from palpate_training.datasets.export import written_new
+from palpate_training.datasets.features import (
+    ELECTRODES,
+    FEATURE_COLUMNS,
+    FeatureDataset,
+    cut_into_blocks,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Values = npt.NDArray[np.float64]
+
+BLOCKS = 20
+"""Contiguous pieces that a file is cut into where nothing says which rows are one press."""
+
+METADATA = b"palpate.features"
+"""Key of a Parquet file's metadata: sensors and provenance, as JSON."""
+
+_STEMS = {
+    "electrodes": ("electrode", ""), "baseline": ("rest", ""), "force": ("force", "_n"),
+    "contact_location": ("contact_location", "_m"),
+    "centre_of_pressure": ("centre_of_pressure", "_m"), "contact_normal": ("contact_normal", ""),
+}  # fmt: skip
+_UNITS = {
+    "force": {"N": 1.0, "mN": 1e-3},
+    "length": {"m": 1.0, "mm": 1e-3},
+    "time": {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9},
+}
+_LENGTHS = ("contact_location", "centre_of_pressure")
+
+Columns = str | Annotated[list[str], Field(min_length=1)]
+
+
+class ColumnMap(BaseModel):
+    """Which columns of a table are what.
+
+    A value is a list of columns, one for each number, or the name of one column that holds all of
+    them; a minus before a name turns the sign. x, y, z are those of the sensor frame: x to the tip,
+    y to the left, z out of the nail (docs/conventions.md).
+
+    Attributes:
+        electrodes: Raw counts of E1 to E19.
+        rest: Counts of the same electrodes, untouched.
+        rest_rows: Instead: the first rows of each sensor, which are untouched.
+        force: Force on the BioTac, x, y, z.
+        contact_location: Tip of the indenter; likewise the next two.
+        centre_of_pressure: Mean of the touched skin, weighted by the pressure.
+        contact_normal: Out of the skin.
+        in_contact: Whether something touches, true or false, or 0 or 1.
+        time: Of the row.
+        group: Press or episode; rows of one are held out together.
+        sensor: Name of the BioTac.
+        force_unit: N or mN.
+        length_unit: m or mm.
+        time_unit: s, ms, us or ns.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    electrodes: Columns
+    rest: Columns | None = None
+    rest_rows: Annotated[int, Field(ge=1)] | None = None
+    force: Columns
+    contact_location: Columns | None = None
+    centre_of_pressure: Columns | None = None
+    contact_normal: Columns | None = None
+    in_contact: str | None = None
+    time: str | None = None
+    group: str | None = None
+    sensor: str | None = None
+    force_unit: Literal["N", "mN"] = "N"
+    length_unit: Literal["m", "mm"] = "m"
+    time_unit: Literal["s", "ms", "us", "ns"] = "s"
+
+    @classmethod
+    def read(cls, path: Path) -> ColumnMap:
+        """Read a TOML file.
+
+        Raises:
+            ConfigError: It is missing, no TOML, or says something else.
+        """
+        try:
+            return cls.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise ConfigError(f"{path}: {error}", remedy="see docs/data.md") from error
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise ConfigError(
+                f"{path}: {where}: {first['msg']}",
+                remedy="electrodes and force must be there; all names: docs/data.md",
+            ) from error
+
+    @classmethod
+    def ours(cls, columns: Sequence[str]) -> ColumnMap:
+        """Of a table with palpate's own names, as far as it has them."""
+        known = {
+            name: names
+            for name in _STEMS
+            if set(names := columns_of(name)) <= set(columns) or name in ("electrodes", "force")
+        }
+        rest = known.pop("baseline", None)
+        single = {name: name for name in ("in_contact", "group", "sensor") if name in columns}
+        time = "time_ns" if "time_ns" in columns else None
+        return cls.model_validate({**known, "rest": rest, "time": time, "time_unit": "ns"} | single)
+
+
+def columns_of(name: str) -> list[str]:
+    """Names that palpate gives the columns of an array with several numbers a row."""
+    stem, unit = _STEMS[name]
+    size = FEATURE_COLUMNS[name].shape[0]
+    ends = [str(number + 1) for number in range(size)] if size == ELECTRODES else list("xyz")
+    return [f"{stem}_{end}{unit}" for end in ends]
+
+
+def table_of(data: FeatureDataset) -> pa.Table:
+    """All arrays of a data set, a column for each number; provenance in the schema's metadata.
+
+    Raises:
+        MissingExtraError: pyarrow is not installed.
+    """
+    arrow = require("pyarrow", extra="training")
+    columns: dict[str, Any] = {}
+    for name, array in data.arrays().items():
+        if name == "sensor":
+            columns[name] = np.array(data.sensor_names, object)[array]
+        elif name in _STEMS:
+            columns |= dict(zip(columns_of(name), array.T, strict=True))
+        else:
+            columns[name] = array
+    facts = {"sensor_names": data.sensor_names, "provenance": asdict(data.provenance)}
+    return arrow.table(columns).replace_schema_metadata({METADATA: json.dumps(facts).encode()})
+
+
+def export_table(path: Path, data: FeatureDataset, *, csv: bool = False) -> None:
+    """Write a table, whole or not at all: Parquet, or CSV.
+
+    Raises:
+        DatasetError: The file exists, or the disk refused.
+        MissingExtraError: pyarrow is not installed.
+    """
+    require("pyarrow", extra="training")
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    table = table_of(data)
+
+    def write(part: Path) -> None:
+        if csv:
+            pyarrow.csv.write_csv(table, part)
+        else:
+            pyarrow.parquet.write_table(table, part, compression="zstd")
+
+    written_new(path, write)
+
+
+def read_table(path: Path) -> pa.Table:
+    """Read a CSV or Parquet file whole.
+
+    Raises:
+        DatasetError: It is missing, or neither.
+        MissingExtraError: pyarrow is not installed.
+    """
+    arrow = require("pyarrow", extra="training")
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    try:
+        if path.suffix.lower() == ".csv":
+            return pyarrow.csv.read_csv(path)
+        return pyarrow.parquet.read_table(path)
+    except (OSError, arrow.ArrowException) as error:
+        raise DatasetError(
+            f"{path} cannot be read as a table: {str(error).splitlines()[0]}",
+            remedy="give a CSV file with a heading, a Parquet file, or a LeRobotDataset's folder",
+        ) from error
+
+
+def dataset_of(
+    table: pa.Table,
+    columns: ColumnMap,
+    *,
+    source: Path,
+    sensor: str | None = None,
+    licence: str = "own table",
+    command: str = "",
+    drop_incomplete: bool = False,
+) -> FeatureDataset:
+    """Rows of features from a table.
+
+    Args:
+        table: Its columns may hold numbers, or lists of them.
+        columns: Which of them is what.
+        source: Where the table was, for errors and provenance.
+        sensor: Name of the BioTac where no column says it; None = the table's file name.
+        licence: What may be done with the rows.
+        command: For provenance.
+        drop_incomplete: Leave rows out in which a number is missing; else they are an error.
+
+    Raises:
+        DatasetError: A column is missing, of another width, or holds something else; a number is
+            missing; electrodes are no whole counts; nothing says what electrodes read untouched.
+    """
+    reader = _Reader(table, source)
+    arrays: dict[str, Any] = {
+        "electrodes": reader.numbers(columns.electrodes, ELECTRODES),
+        "force": reader.numbers(columns.force, 3) * _UNITS["force"][columns.force_unit],
+    }
+    if columns.rest is not None:
+        arrays["baseline"] = reader.numbers(columns.rest, ELECTRODES)
+    for name in (*_LENGTHS, "contact_normal"):
+        if (names := getattr(columns, name)) is not None:
+            scale = _UNITS["length"][columns.length_unit] if name in _LENGTHS else 1.0
+            arrays[name] = reader.numbers(names, 3) * scale
+    if columns.in_contact is not None:
+        arrays["in_contact"] = reader.truths(columns.in_contact)
+    if columns.time is not None:
+        arrays["time_ns"] = reader.times(columns.time, _UNITS["time"][columns.time_unit])
+    names, arrays["sensor"] = reader.labels(columns.sensor, sensor or source.stem)
+    _, arrays["group"] = reader.labels(columns.group, "")
+    rows = len(arrays["electrodes"])
+    kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
+    arrays = {name: array[kept] for name, array in arrays.items()}
+    arrays["electrodes"] = _counts(arrays["electrodes"], source)
+    if "baseline" not in arrays:
+        arrays["baseline"] = _rest(arrays, columns.rest_rows, source)
+    arrays |= _groups(arrays, cut=columns.group is None)
+    left_out = rows - len(arrays["electrodes"])
+    return FeatureDataset(
+        **{name: arrays[name].astype(FEATURE_COLUMNS[name].dtype) for name in arrays},
+        sensor_names=names,
+        provenance=Provenance(
+            source=f"{source.name}, {rows} rows",
+            command=command,
+            input_sha256=sha256_of(source) if source.is_file() else "",
+            licence=licence,
+            palpate_version=__version__,
+            notes=f"columns: {columns.model_dump_json(exclude_none=True)}"
+            + (f"; {left_out} incomplete rows left out" if left_out else ""),
+        ),
+        name=str(source),
+    )
+
+
+class _Reader:
+    """Columns of a table by name, with errors that say which and where."""
+
+    def __init__(self, table: pa.Table, source: Path) -> None:
+        self._table, self._source = table, source
+        if not table.num_rows:
+            raise DatasetError(f"{source} has no rows", remedy="give a table with rows")
+
+    def numbers(self, names: Columns, width: int) -> Values:
+        """Numbers, shape (N, width); NaN where one is missing."""
+        if isinstance(names, str):
+            return self._lists(names, width)
+        if len(names) != width:
+            raise DatasetError(
+                f"{self._source}: {len(names)} columns are named from {names[0]!r} on, not {width}",
+                remedy="name one column for each, in order",
+            )
+        return np.stack([self._column(name) for name in names], axis=1)
+
+    def truths(self, name: str) -> npt.NDArray[np.bool_]:
+        """True and false, shape (N,)."""
+        values = self._column(name)
+        wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
+        if wrong.size:
+            raise self._wrong(name, int(wrong[0]), f"{values[wrong[0]]:g}", "true or false")
+        return np.asarray(values == 1.0)
+
+    def times(self, name: str, scale: float) -> npt.NDArray[np.int64]:
+        """Times [ns], shape (N,); whole numbers are not rounded."""
+        column = self._found(name)
+        if scale == 1.0 and str(column.type) in ("int64", "uint64", "int32", "uint32"):
+            return np.asarray(column.to_numpy(), np.int64)
+        values = self._column(name)
+        wrong = np.flatnonzero(~(np.abs(values * scale) < 2.0**63))
+        if wrong.size:
+            raise self._wrong(name, int(wrong[0]), f"{values[wrong[0]]:g}", "a time")
+        return np.rint(values * scale).astype(np.int64)
+
+    def labels(self, name: str | None, else_: str) -> tuple[tuple[str, ...], Any]:
+        """Labels in order of appearance, and the number of each row's, shape (N,)."""
+        if name is None:
+            return (else_,), np.zeros(self._table.num_rows, np.int64)
+        words = np.array([str(value) for value in self._found(name).to_pylist()], object)
+        labels = tuple(dict.fromkeys(words))
+        return labels, np.array([labels.index(word) for word in words], np.int64)
+
+    def _found(self, name: str) -> Any:
+        if name not in self._table.column_names:
+            there = ", ".join(self._table.column_names[:40])
+            raise DatasetError(
+                f"{self._source} has no column {name!r}; it has: {there}",
+                remedy="say which columns are what: --columns MAP.toml, see docs/data.md",
+            )
+        return self._table.column(name)
+
+    def _column(self, name: str) -> Values:
+        """Numbers of one column, shape (N,); a minus before its name turns the sign."""
+        plain = name.removeprefix("-") if name not in self._table.column_names else name
+        column = self._found(plain)
+        try:
+            values = np.asarray(column.cast("float64", safe=False).to_numpy(), np.float64)
+        except (ValueError, TypeError) as error:  # of Arrow: its base is ValueError or TypeError
+            raise DatasetError(
+                f"{self._source}: column {plain!r} holds {column.type}, not numbers",
+                remedy="name another column",
+            ) from error
+        return values if plain == name else -values
+
+    def _lists(self, name: str, width: int) -> Values:
+        column = self._found(name)
+        if "list" not in str(column.type):
+            return self.numbers([name], width)
+        rows = column.to_pylist()
+        for number, row in enumerate(rows):
+            if row is None or len(row) != width:
+                size = "nothing" if row is None else f"{len(row)} numbers"
+                raise self._wrong(name, number, size, f"{width} numbers")
+        return np.array(rows, np.float64)
+
+    def _wrong(self, name: str, row: int, found: str, wanted: str) -> DatasetError:
+        return DatasetError(
+            f"{self._source}: column {name!r} holds {found} in row {row}, not {wanted}",
+            remedy="mend the table, or name another column",
+        )
+
+
+def _complete(
+    arrays: Mapping[str, Any], source: Path, *, drop_incomplete: bool
+) -> npt.NDArray[np.bool_]:
+    """Rows in which nothing is missing that must be there."""
+    kept = np.ones(len(arrays["electrodes"]), np.bool_)
+    touching = arrays.get("in_contact", kept)
+    for name, values in arrays.items():
+        if values.ndim == 2:
+            needed = touching if name in (*_LENGTHS, "contact_normal") else True
+            lacking = ~np.isfinite(values).all(axis=1) & needed
+            if lacking.any() and not drop_incomplete:
+                raise DatasetError(
+                    f"{source}: {name} is not known in row {np.flatnonzero(lacking)[0]}"
+                    f" ({lacking.sum()} rows in all)",
+                    remedy="mend the table, or leave such rows out: --drop-incomplete",
+                )
+            kept &= ~lacking
+    if not kept.any():
+        raise DatasetError(f"{source}: no row is complete", remedy="see which columns are empty")
+    return kept
+
+
+def _counts(values: Values, source: Path) -> Values:
+    """Electrodes, as whole counts."""
+    counts = np.rint(values)
+    bad = np.abs(values - counts) > 1e-6
+    bad |= (values < 0.0) | (values > COUNTS_MAX)
+    if bad.any():
+        row, electrode = (int(index) for index in np.argwhere(bad)[0])
+        raise DatasetError(
+            f"{source}: E{electrode + 1} reads {values[row, electrode]:g} in row {row},"
+            f" not whole counts from 0 to {COUNTS_MAX}",
+            remedy="give raw counts as the BioTac sends them, nothing subtracted or scaled",
+        )
+    return np.asarray(counts)
+
+
+def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
+    """Untouched counts of each row: the mean of the first rows of its sensor."""
+    if rows is None:
+        raise DatasetError(
+            f"{source}: nothing says what the electrodes read untouched",
+            remedy="name columns of the rest, or untouched rows at the beginning: rest_rows = 100",
+        )
+    rest: Values = np.empty_like(arrays["electrodes"])
+    for sensor in np.unique(arrays["sensor"]):
+        own = np.flatnonzero(arrays["sensor"] == sensor)
+        if len(own) <= rows:
+            raise DatasetError(
+                f"{source}: a sensor has {len(own)} rows, {rows} of them untouched",
+                remedy="give fewer untouched rows: rest_rows",
+            )
+        rest[own] = arrays["electrodes"][own[:rows]].mean(axis=0)
+    return rest
+
+
+def _groups(arrays: Mapping[str, Any], *, cut: bool) -> dict[str, Any]:
+    """Group and block of each row: as labelled, or pieces of each sensor's rows."""
+    labels = np.stack([arrays["sensor"], arrays["group"]])
+    _, group = np.unique(labels, axis=1, return_inverse=True)
+    group = group.reshape(-1)
+    if not cut:
+        return {"group": group, "block": group}
+    block = np.empty_like(group)
+    for number in np.unique(group):
+        own = np.flatnonzero(group == number)
+        pieces = min(BLOCKS, len(own))
+        block[own] = BLOCKS * number + cut_into_blocks(len(own), pieces)
+    return {"group": group, "block": block}
