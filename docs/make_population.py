@@ -352,7 +352,8 @@ TOLD = """## What it says
 * **Ten presses tell a finger that was never met** as well as one that was: {force_10:.3f} and
   {met:.3f} N, {ratio:.2f} times as much (goal 1.2). Without one, forces are too small or too large
   by one factor: {force_0:.2f} N; with one press {force_1:.2f} N, with five {force_5:.2f} N. One
-  factor fitted to the ten presses reaches {factor:.2f} N.
+  factor fitted to the ten presses reaches {factor:.2f} N. Centre and normal have a ratio of
+  {ratio_centre:.2f} and {ratio_normal:.2f}.
 * **The electrodes at rest are not read.** They name a specimen of the training, which is then known
   by heart; presses count for nothing, and a finger that was not met is estimated twice as badly
   ([LOG](../../training/LOG.md)).
@@ -386,14 +387,24 @@ def told(reports: list[dict[str, Any]]) -> str:
     def known(cell: str, shots: str, figure: str = key, who: str = "network") -> float:
         return mean(lambda cells: cells[cell]["shots"][shots][who][figure])
 
+    def ratio(figure: str) -> float:
+        return mean(
+            lambda cells: (
+                cells[never]["shots"]["10"]["network"][figure]
+                / cells[met]["shots"]["10"]["network"][figure]
+            )
+        )
+
     def constant(figure: str) -> float:
         return mean(lambda cells: cells[never]["constant"][figure])
 
     return TOLD.format(
         met=known(met, "10"),
         **{f"force_{n}": known(never, n) for n in ("0", "1", "5", "10")},
-        ratio=known(never, "10") / known(met, "10"),
+        ratio=ratio(key),
         factor=known(never, "10", who="one factor"),
+        ratio_centre=ratio("centre_of_pressure_mm"),
+        ratio_normal=ratio("normal_angle_rad"),
         specimen=known(specimen, "0"),
         specimen_10=known(specimen, "10"),
         location_0=known(never, "0", "contact_location_mm"),

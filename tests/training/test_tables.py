@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -33,7 +34,7 @@ STEP_NS = 10_000_000
 def data() -> FeatureDataset:
     known = population(specimens=3, presses=6, each=2)
     order = np.lexsort((np.arange(len(known)), known.group, known.sensor))
-    arrays = {name: array[order] for name, array in known.arrays().items()}
+    arrays: dict[str, Any] = {name: array[order] for name, array in known.arrays().items()}
     arrays["time_ns"] = np.arange(len(known), dtype=np.int64) * STEP_NS + 10**18
     return FeatureDataset(
         **arrays,
@@ -52,8 +53,11 @@ def test_a_table_comes_back_as_it_was(data: FeatureDataset, tmp_path: Path, csv:
     for name, array in data.arrays().items():
         if name not in ("group", "block"):
             np.testing.assert_array_equal(getattr(back, name), array, err_msg=name)
-    pairs = np.stack([data.group, data.sensor, back.group])
-    assert len(np.unique(pairs, axis=1).T) == len(np.unique(back.group))
+    for name in ("group", "block"):
+        labels = np.stack([getattr(data, name), data.sensor, getattr(back, name)])
+        assert len(np.unique(labels, axis=1).T) == len(np.unique(labels[2]))
+    assert back.provenance.notes == "palpate's own columns"
+    assert back.provenance.licence == ("not stated" if csv else "free")
     with pytest.raises(DatasetError, match="exists"):
         export_table(path, data, csv=csv)
 
@@ -93,7 +97,7 @@ def test_a_strangers_table_is_read_by_a_map(data: FeatureDataset, tmp_path: Path
 
 
 def test_without_groups_a_file_is_cut_into_blocks(data: FeatureDataset) -> None:
-    table = table_of(data).drop_columns(["group", "sensor"])
+    table = table_of(data).drop_columns(["group", "block", "sensor"])
     back = dataset_of(table, ColumnMap.ours(table.column_names), source=Path("x.csv"))
     assert len(np.unique(back.block)) == 20
     assert len(np.unique(back.group)) == 1
@@ -215,6 +219,7 @@ def test_a_lerobot_dataset_has_episodes_at_an_even_rate(
     back = dataset_of(table, columns, source=tmp_path / "set")
     np.testing.assert_array_equal(back.electrodes, data.electrodes)
     np.testing.assert_array_equal(back.time_ns, times)
+    assert back.provenance.licence == "free"
     with pytest.raises(DatasetError, match="exists"):
         export_lerobot(tmp_path / "set", data)
 

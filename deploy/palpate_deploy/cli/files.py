@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from palpate.errors import ConfigError
 from palpate_deploy.cli.options import (
     DEFAULT_CONNECT,
     DEFAULT_STATION,
@@ -95,6 +96,13 @@ def review(
             "with one --trajectory its last step."
         ),
     ] = None,
+    foxglove: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="NAME.mcap",
+            help="Of a record: write a file for Foxglove instead, with forces and skin in 3D.",
+        ),
+    ] = None,
     trajectory: Annotated[
         list[str] | None,
         typer.Option(
@@ -114,10 +122,18 @@ def review(
         ),
     ] = None,
 ) -> None:
-    """Make a Rerun view of a record, or of a store of simulations."""
-    from palpate_deploy.diagnose.records import review_path
+    """Make a Rerun view of a record, or of a store of simulations; or a record for Foxglove."""
+    from palpate_deploy.diagnose.records import review_path, write_foxglove
 
     named = tuple(trajectory or ())
+    if foxglove is not None:
+        if out is not None or png is not None or named:
+            raise ConfigError(
+                "--foxglove writes one file, of a record",
+                remedy="leave out --out, --png and --trajectory",
+            )
+        write_foxglove(existing_file(path), foxglove, bundles=tuple(bundle or ()))
+        return
     review_path(path, out, png, trajectories=named, most=most, bundles=tuple(bundle or ()))
 
 
@@ -142,7 +158,7 @@ def register(app: typer.Typer) -> None:
     for command, lines in (
         (record, ("palpate record --out runs --duration-s 60",)),
         (replay, ("palpate replay data.btd.gz", "palpate replay runs/lab.mcap --pace recorded")),
-        (review, ("palpate review runs/lab.mcap", "palpate review sweep.sim --most 4")),
+        (review, ("palpate review lab.mcap", "palpate review lab.mcap --foxglove f.mcap")),
         (info, ("palpate info runs/lab.mcap",)),
         (recover, ("palpate recover runs/lab.mcap.part",)),
     ):

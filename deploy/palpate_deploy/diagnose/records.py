@@ -159,6 +159,24 @@ def review_path(
         print(f"look at it: {viewer_command(written)}")
 
 
+def write_foxglove(record: Path, out: Path, *, bundles: Sequence[str] = ()) -> None:
+    """Write a record for Foxglove, and print what is in its scenes.
+
+    Raises:
+        ConfigError: It would replace the record, or there is no such bundle.
+        RecordingError: The record is damaged or not palpate's.
+        DatasetError: The disk refused.
+        MissingExtraError: Foxglove's messages are not installed.
+    """
+    from palpate_services.viewer.foxglove import export_foxglove
+
+    counts = export_foxglove(record, out, bundles=bundles)
+    print(f"{printable(str(out))}  ({out.stat().st_size / 1e6:.1f} MB)")
+    for topic, count in sorted(counts.items()):
+        print(f"  {printable(topic)}: {count:,}")
+    print("open it in Foxglove, add a 3D panel, and follow the frame of a sensor")
+
+
 def error_lines(errors: RecordErrors) -> list[str]:
     """Errors by force as lines of text: those of touched frames first."""
     touched = errors.touched

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from palpate.errors import DatasetError
+from palpate.errors import DatasetError, PalpateError
 
 
 @contextlib.contextmanager
@@ -24,6 +24,8 @@ def written_whole(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         os.replace(partial, path)
+    except PalpateError:  # some are OSErrors, too, of what the block read
+        raise
     except OSError as error:
         raise DatasetError(
             f"cannot write {path}: {error}", remedy="check the folder's rights and free space"

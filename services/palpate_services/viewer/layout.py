@@ -43,7 +43,7 @@ STEP = "step"
 SIDES = ("left", "right")
 """Halves of the skin, y > 0 and y < 0; without the right one the finger is cut open."""
 
-_POSITIONS = {
+ELECTRODE_PLACES = {
     SensorType.BIOTAC: ELECTRODE_POSITIONS,
     SensorType.BIOTAC_SP: SP_ELECTRODE_POSITIONS,
 }
@@ -231,7 +231,7 @@ def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[
     elif again:
         yield "finger/core", rr.Mesh3D.cleared()
         yield "finger/skin", rr.LineStrips3D.cleared()
-    positions = _POSITIONS[kind]
+    positions = ELECTRODE_PLACES[kind]
     yield "finger/electrodes", rr.Points3D(positions, radii=[7.5e-4])
     # A text has the colour of its point. These are too small to be seen, and have the colours of
     # the curves; those of the electrodes themselves change with their counts.

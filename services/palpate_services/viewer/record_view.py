@@ -34,7 +34,7 @@ from palpate_services.viewer.layout import (
     record_fixtures,
     record_layout,
 )
-from palpate_services.viewer.surfaces import normals_of, shades
+from palpate_services.viewer.surfaces import OuterSkin, normals_of, shades
 from palpate_services.viewer.timeline import FieldRow, SensorTimeline, TimelineRow
 
 _log = logging.getLogger(__name__)
@@ -52,16 +52,6 @@ _CURVES = ("electrodes/raw", "electrodes/tared", "error/force", "error/location_
 Send = Callable[[str, list[Any], Iterable[Any]], None]
 
 
-class _Skin:
-    """The outer surface of a mesh, with node numbers of its own: inner nodes would be invisible."""
-
-    def __init__(self, mesh: FieldMesh) -> None:
-        used, triangles = np.unique(mesh.outer_faces, return_inverse=True)
-        self.used: npt.NDArray[np.int32] = used
-        self.triangles = triangles.reshape(-1, 3).astype(np.int32)
-        self.rest: FloatArray = mesh.nodes[used]
-
-
 class FieldDrawer:
     """Draws fields on the skins of their meshes.
 
@@ -74,7 +64,7 @@ class FieldDrawer:
         self._rr = rr
         self._stream = stream
         self._meshes = meshes
-        self._skins: dict[bytes, _Skin] = {}
+        self._skins: dict[bytes, OuterSkin] = {}
         self._begun: set[str] = set()
 
     def draw(self, entity: str, rows: list[FieldRow], send: Send) -> None:
@@ -94,7 +84,7 @@ class FieldDrawer:
     def _draw(self, entity: str, mesh: FieldMesh, rows: list[FieldRow], send: Send) -> None:
         skin = self._skins.get(mesh.sha256)
         if skin is None:
-            skin = self._skins[mesh.sha256] = _Skin(mesh)
+            skin = self._skins[mesh.sha256] = OuterSkin(mesh)
         rr = self._rr
         if entity not in self._begun:
             self._begun.add(entity)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from palpate.files.bundle import FieldMesh
 from palpate.messages import FloatArray
 
 Floats = npt.NDArray[np.floating[Any]]
@@ -29,6 +30,22 @@ _SCALE = np.array(
     [[150, 156, 166], [62, 116, 178], [33, 165, 150], [94, 201, 98], [253, 231, 37]], np.float64
 )
 """Colours from no displacement (grey, so that the shape shows on a dark ground) to the largest."""
+
+
+class OuterSkin:
+    """The outer surface of a mesh, with node numbers of its own: inner nodes would be invisible.
+
+    Attributes:
+        used: Numbers of its nodes in the mesh, shape (U,).
+        triangles: Of its own numbers, shape (T, 3).
+        rest: Where its nodes are untouched [m], shape (U, 3).
+    """
+
+    def __init__(self, mesh: FieldMesh) -> None:
+        used, triangles = np.unique(mesh.outer_faces, return_inverse=True)
+        self.used: Ints = used
+        self.triangles: Ints = triangles.reshape(-1, 3).astype(np.int32)
+        self.rest: FloatArray = mesh.nodes[used]
 
 
 def packed_rgba(rgb: npt.NDArray[np.uint32]) -> npt.NDArray[np.uint32]:

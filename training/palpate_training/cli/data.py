@@ -136,8 +136,9 @@ def data_import(
         str | None, typer.Option(help="Name of the BioTac, if no column says it.")
     ] = None,
     licence: Annotated[
-        str, typer.Option(help="What may be done with the rows; kept with them.")
-    ] = "own table",
+        str | None,
+        typer.Option(help="What may be done with the rows; none = as a file of ours says."),
+    ] = None,
     drop_incomplete: Annotated[
         bool, typer.Option("--drop-incomplete", help="Leave rows out that lack a number.")
     ] = False,

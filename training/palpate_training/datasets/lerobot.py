@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ from palpate.errors import DatasetError
 from palpate.process import require
 from palpate_training.datasets.export import written_new
 from palpate_training.datasets.features import ELECTRODES, FeatureDataset
-from palpate_training.datasets.tables import read_table
+from palpate_training.datasets.tables import METADATA, facts_of, read_table
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -133,7 +132,8 @@ def read_lerobot(folder: Path) -> pa.Table:
             remedy="fetch the whole data set, with its large files",
         )
     try:
-        return arrow.concat_tables(tables)
+        known = {METADATA: json.dumps(info.get(METADATA.decode(), {})).encode()}
+        return arrow.concat_tables(tables).replace_schema_metadata(known)
     except arrow.ArrowException as error:
         raise DatasetError(
             f"{folder}: its files have different columns: {error}", remedy="fetch it again"
@@ -243,7 +243,7 @@ def _info(
         "data_path": _DATA,
         "video_path": None,
         "features": features,
-        "palpate": {"sensors": data.sensor_names, "provenance": asdict(data.provenance)},
+        METADATA.decode(): json.loads(facts_of(data)),
     }
 
 

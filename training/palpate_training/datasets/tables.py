@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 Values = npt.NDArray[np.float64]
 
 BLOCKS = 20
-"""Contiguous pieces that a file is cut into where nothing says which rows are one press."""
+"""Contiguous pieces that a sensor's rows are cut into where nothing says what one press is."""
 
 METADATA = b"palpate.features"
-"""Key of a Parquet file's metadata: sensors and provenance, as JSON."""
+"""Key of a table's metadata: where its rows come from, as JSON."""
 
 _STEMS = {
     "electrodes": ("electrode", ""), "baseline": ("rest", ""), "force": ("force", "_n"),
@@ -75,7 +75,9 @@ class ColumnMap(BaseModel):
         contact_normal: Out of the skin.
         in_contact: Whether something touches, true or false, or 0 or 1.
         time: Of the row.
-        group: Press or episode; rows of one are held out together.
+        group: Press or episode.
+        block: Piece of a group that is held out as a whole; none = the group, or where each sensor
+            has but one, twenty pieces of it.
         sensor: Name of the BioTac.
         force_unit: N or mN.
         length_unit: m or mm.
@@ -94,6 +96,7 @@ class ColumnMap(BaseModel):
     in_contact: str | None = None
     time: str | None = None
     group: str | None = None
+    block: str | None = None
     sensor: str | None = None
     force_unit: Literal["N", "mN"] = "N"
     length_unit: Literal["m", "mm"] = "m"
@@ -127,7 +130,9 @@ class ColumnMap(BaseModel):
             if set(names := columns_of(name)) <= set(columns) or name in ("electrodes", "force")
         }
         rest = known.pop("baseline", None)
-        single = {name: name for name in ("in_contact", "group", "sensor") if name in columns}
+        single = {
+            name: name for name in ("in_contact", "group", "block", "sensor") if name in columns
+        }
         time = "time_ns" if "time_ns" in columns else None
         return cls.model_validate({**known, "rest": rest, "time": time, "time_unit": "ns"} | single)
 
@@ -155,8 +160,12 @@ def table_of(data: FeatureDataset) -> pa.Table:
             columns |= dict(zip(columns_of(name), array.T, strict=True))
         else:
             columns[name] = array
-    facts = {"sensor_names": data.sensor_names, "provenance": asdict(data.provenance)}
-    return arrow.table(columns).replace_schema_metadata({METADATA: json.dumps(facts).encode()})
+    return arrow.table(columns).replace_schema_metadata({METADATA: facts_of(data)})
+
+
+def facts_of(data: FeatureDataset) -> bytes:
+    """Where the rows come from, as JSON: what a file of ours says beside its columns."""
+    return json.dumps({"provenance": asdict(data.provenance)}).encode()
 
 
 def export_table(path: Path, data: FeatureDataset, *, csv: bool = False) -> None:
@@ -209,7 +218,7 @@ def dataset_of(
     *,
     source: Path,
     sensor: str | None = None,
-    licence: str = "own table",
+    licence: str | None = None,
     command: str = "",
     drop_incomplete: bool = False,
 ) -> FeatureDataset:
@@ -220,7 +229,7 @@ def dataset_of(
         columns: Which of them is what.
         source: Where the table was, for errors and provenance.
         sensor: Name of the BioTac where no column says it; None = the table's file name.
-        licence: What may be done with the rows.
+        licence: What may be done with the rows; None = as a file of ours says, else it is unknown.
         command: For provenance.
         drop_incomplete: Leave rows out in which a number is missing; else they are an error.
 
@@ -244,29 +253,48 @@ def dataset_of(
     if columns.time is not None:
         arrays["time_ns"] = reader.times(columns.time, _UNITS["time"][columns.time_unit])
     names, arrays["sensor"] = reader.labels(columns.sensor, sensor or source.stem)
-    _, arrays["group"] = reader.labels(columns.group, "")
+    for name in ("group", "block"):
+        _, arrays[name] = reader.labels(getattr(columns, name), "")
     rows = len(arrays["electrodes"])
     kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
     arrays = {name: array[kept] for name, array in arrays.items()}
     arrays["electrodes"] = _counts(arrays["electrodes"], source)
     if "baseline" not in arrays:
         arrays["baseline"] = _rest(arrays, columns.rest_rows, source)
-    arrays |= _groups(arrays, cut=columns.group is None)
+    arrays |= _groups(arrays, labelled=columns.block is not None)
     left_out = rows - len(arrays["electrodes"])
+    known = _provenance(table)
     return FeatureDataset(
         **{name: arrays[name].astype(FEATURE_COLUMNS[name].dtype) for name in arrays},
         sensor_names=names,
         provenance=Provenance(
-            source=f"{source.name}, {rows} rows",
+            source=known.get("source", f"{source.name}, {rows} rows"),
             command=command,
             input_sha256=sha256_of(source) if source.is_file() else "",
-            licence=licence,
+            licence=licence or known.get("licence", "not stated"),
             palpate_version=__version__,
-            notes=f"columns: {columns.model_dump_json(exclude_none=True)}"
-            + (f"; {left_out} incomplete rows left out" if left_out else ""),
+            notes="; ".join(_notes(columns, table.column_names, left_out)),
         ),
         name=str(source),
     )
+
+
+def _provenance(table: pa.Table) -> dict[str, str]:
+    """What a file of ours says of its rows; nothing of a file of others."""
+    try:
+        facts = json.loads((table.schema.metadata or {})[METADATA])["provenance"]
+        return {name: str(facts[name]) for name in ("source", "licence")}
+    except (KeyError, TypeError, ValueError):
+        return {}
+
+
+def _notes(columns: ColumnMap, names: Sequence[str], left_out: int) -> Iterator[str]:
+    if columns == ColumnMap.ours(names):
+        yield "palpate's own columns"
+    else:
+        yield f"columns: {columns.model_dump_json(exclude_defaults=True)}"
+    if left_out:
+        yield f"{left_out} incomplete rows left out"
 
 
 class _Reader:
@@ -411,14 +439,14 @@ def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
     return rest
 
 
-def _groups(arrays: Mapping[str, Any], *, cut: bool) -> dict[str, Any]:
+def _groups(arrays: Mapping[str, Any], *, labelled: bool) -> dict[str, Any]:
     """Group and block of each row: as labelled, or pieces of each sensor's rows."""
-    labels = np.stack([arrays["sensor"], arrays["group"]])
-    _, group = np.unique(labels, axis=1, return_inverse=True)
-    group = group.reshape(-1)
-    if not cut:
-        return {"group": group, "block": group}
-    block = np.empty_like(group)
+    labels = np.stack([arrays[name] for name in ("sensor", "group", "block")])
+    group, block = (
+        np.unique(labels[:count], axis=1, return_inverse=True)[1].reshape(-1) for count in (2, 3)
+    )
+    if labelled or group.max() > arrays["sensor"].max():
+        return {"group": group, "block": block}
     for number in np.unique(group):
         own = np.flatnonzero(group == number)
         pieces = min(BLOCKS, len(own))
