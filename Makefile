@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs fmt proto bundle build clean
+.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs fmt proto bundle build wheel release clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -113,9 +113,25 @@ proto: $(VENV)/.dev  ## regenerate the Python of the .proto files and their page
 bundle: $(VENV)/.dev  ## train the shipped bundle again, on the virtual finger | 1-5 min
 	$(BIN)/palpate bundle virtual
 
-build: $(VENV)/.dev  ## the wheel, into dist/ | 20 s
-	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
-	@ls -1 dist/*.whl
+build: $(VENV)/.dev  ## wheel and source archive, into dist/; the same bytes from the same tree | 10 s
+	rm -rf dist
+	@$(BIN)/python -m hatchling build -d dist
+
+wheel: build  ## try the wheel in fresh environments: make wheel ON="python3.11 python3.13" | 2 min each
+	@for python in $(or $(ON),python3.11 python3.12 python3.13); do \
+		command -v $$python >/dev/null || { echo "$$python: not on this host"; continue; }; \
+		home=$$(mktemp -d); wheel=$$(ls dist/*.whl); $$python -m venv $$home/env; \
+		$$home/env/bin/pip install --quiet --disable-pip-version-check "$$wheel[gateway,fem,services,metrics]"; \
+		(cd $$home && env/bin/palpate doctor && env/bin/palpate demo --seconds 3 --out demo); \
+		rm -rf $$home; echo "$$python: the wheel works"; \
+	done
+
+release: $(VENV)/.dev  ## version, changelog and files of a release: make release VERSION=1.2.0 | 20 s
+	@[[ "$(VERSION)" =~ ^[0-9]+\.[0-9]+\.[0-9]+$$ ]] || { echo "say which: make release VERSION=1.2.0"; exit 2; }
+	sed -i 's/^version = ".*"/version = "$(VERSION)"/' pyproject.toml
+	sed -i 's/^version: .*/version: $(VERSION)/' CITATION.cff
+	$(BIN)/towncrier build --yes --version $(VERSION)
+	@$(MAKE) build
 
 clean:  ## remove caches and built files; keep .venv and recordings | 1 s
 	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

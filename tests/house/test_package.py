@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
@@ -98,6 +100,32 @@ def test_wheel_of_the_sdist_is_the_wheel_of_the_tree(wheel: Path, tmp_path: Path
         archive.extractall(tmp_path / "source", filter="data")
     (source,) = (tmp_path / "source").iterdir()
     assert _contents(_build(source, "wheel", tmp_path / "wheel")) == _contents(wheel)
+
+
+@pytest.mark.parametrize("target", ["wheel", "sdist"])
+def test_the_same_tree_gives_the_same_bytes(
+    target: str, project_files: list[Path], tmp_path: Path
+) -> None:
+    """In another folder, at another time, with other rights of the files."""
+    built = []
+    for number, name in enumerate(("one", "two")):
+        source = tmp_path / name
+        for path in project_files:
+            copy = source / path.relative_to(ROOT)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
+            os.utime(copy, (10**9 + number, 10**9 + number))
+            copy.chmod(0o600 if number else 0o644)
+        built.append(_build(source, target, tmp_path / f"{name}-out").read_bytes())
+        shutil.rmtree(source)
+    assert built[0] == built[1]
+
+
+def test_one_version_is_told_everywhere() -> None:
+    facts = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    version = facts["project"]["version"]
+    assert facts["tool"]["towncrier"]["version"] == version
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_robot_needs_one_name(installed: Path, tmp_path: Path) -> None:
