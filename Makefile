@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs fmt proto bundle build wheel release clean
+.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel release clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -100,6 +100,10 @@ docs: $(VENV)/.dev  ## regenerate generated pages and pictures, check all links 
 	$(BIN)/towncrier build --draft >/dev/null
 	$(BIN)/pytest -q tests/house/test_docs.py
 
+site: $(VENV)/.dev  ## the documentation site, into build/site; every warning and dead link is an error | 40 s
+	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs/site . build/site
+	@echo "palpate: open build/site/index.html"
+
 fmt: $(VENV)/.dev  ## format Python and .proto files, repair what lint can | 5 s
 	$(BIN)/ruff check --fix-only --quiet
 	$(BIN)/ruff format
@@ -182,5 +186,5 @@ $(VENV)/.demo: $(VENV)/.made pyproject.toml
 $(VENV)/.dev: $(VENV)/.made pyproject.toml
 	@echo "palpate: installing everything into $(VENV) (torch and the developer's tools), 3-8 minutes"
 	@$(pip_install) '$(TORCH)' | $(show)
-	@$(pip_install) -e '.[all,cluster,dev]' | $(show)
+	@$(pip_install) -e '.[all,cluster,dev,docs]' | $(show)
 	@touch $(VENV)/.demo $@

@@ -247,7 +247,7 @@ def crossing(before: Floats, after: Floats) -> float:
     """Where on the segment between two forces the magnitude is exactly the threshold.
 
     The magnitude of an interpolated vector is not the interpolated magnitude: where the direction
-    turns, it is smaller. So |a + s (b - a)|^2 = threshold^2 is solved for s.
+    turns, it is smaller. So ``|a + s (b - a)|^2 = threshold^2`` is solved for s.
 
     Args:
         before: Force [N] of magnitude below the threshold, shape (3,).
