@@ -93,6 +93,7 @@ docs: $(VENV)/.dev  ## regenerate generated pages and pictures, check all links 
 	$(BIN)/python docs/make_electrode_map.py
 	$(BIN)/python docs/make_fingertip_mesh.py
 	$(BIN)/python docs/make_indenters.py
+	$(BIN)/python docs/make_failures.py
 	$(BIN)/python docs/make_house.py
 	$(BIN)/python docs/make_models.py
 	$(BIN)/python docs/make_study.py

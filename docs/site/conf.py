@@ -1,8 +1,8 @@
 """The documentation site: ``make site`` builds the project's Markdown into build/site.
 
-Pages are the Markdown files of the repository, which read as well on a code host; nothing is written
-for the site alone but the lists below and the reference of the Python packages (``api``). A page
-that no list names appears under its folder, so a new one needs no entry here.
+Pages are the Markdown files of the repository, which read as well on a code host; nothing is
+written for the site alone but the lists below and the reference of the Python packages (``api``). A
+page that no list names appears under its folder, so a new one needs no entry here.
 Why it is built so: docs/adr/0032-documentation-site.md.
 """
 
@@ -56,7 +56,13 @@ SECTIONS = {
     "Guides": ["docs/guides/*"],
     "Concepts": ["docs/concepts/*", "docs/conventions", "docs/tare-and-health", "docs/time"],
     "Experiment and models": ["docs/twin", "docs/testbed", "docs/models", "docs/simulation-store"],
-    "Operate": ["docs/operations", "docs/failures", "docs/security", "docs/devices/README", "docs/ros"],
+    "Operate": [
+        "docs/operations",
+        "docs/failures",
+        "docs/security",
+        "docs/devices/README",
+        "docs/ros",
+    ],
     "Reference": ["docs/site/api/*", "docs/messages", "docs/asyncapi", "docs/examples/README"],
     "Results": ["docs/results/*"],
     "More": ["docs/*"],

@@ -136,6 +136,7 @@ def test_palpate_commands_exist(
     [
         "make_messages.py",
         "make_asyncapi.py",
+        "make_failures.py",
         "make_house.py",
         "make_models.py",
         "make_numbers.py",
