@@ -13,9 +13,11 @@ import ast
 import re
 import sys
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
+from typing import Any
 
 from palpate.errors import ErrorCode
 from palpate.messages import FaultKind, QualityFlag, SensorState, ServiceState
@@ -136,6 +138,8 @@ class Failure:
 
 
 Module = tuple[str, ast.Module]
+Causes = Mapping[Any, tuple[str, str]]
+"""Member of an enumeration -> what causes it, and what to do."""
 
 
 def modules() -> list[Module]:
@@ -235,12 +239,15 @@ def _assigned(lines: Iterable[ast.AST], known: Texts, prefix: str = "") -> Texts
     """Texts that names stand for; several of one name are shown side by side."""
     found: dict[str, list[str]] = defaultdict(list)
     for line in lines:
-        targets = line.targets if isinstance(line, ast.Assign) else []
-        if isinstance(line, ast.AnnAssign) and line.value is not None:
-            targets = [line.target]
+        if isinstance(line, ast.Assign):
+            targets, value = line.targets, line.value
+        elif isinstance(line, ast.AnnAssign) and line.value is not None:
+            targets, value = [line.target], line.value
+        else:
+            continue
         for target in targets:
-            if isinstance(target, ast.Name) and line.value and _is_text(line.value):
-                found[prefix + target.id].append(text_of(line.value, known))
+            if isinstance(target, ast.Name) and _is_text(value):
+                found[prefix + target.id].append(text_of(value, known))
     return {name: _either(texts) for name, texts in found.items()}
 
 
@@ -304,8 +311,10 @@ def _calls(tree: ast.Module) -> Calls:
         for child in ast.iter_child_nodes(node):
             if isinstance(child, ast.Call):
                 found.append((inside, child))
-            is_function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)
-            look(child, child if is_function else inside)
+            if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+                look(child, child)
+            else:
+                look(child, inside)
 
     look(tree, None)
     return found
@@ -377,35 +386,32 @@ def _member_docs(path: str, name: str) -> dict[str, str]:
     return docs
 
 
-def _states() -> Iterator[str]:
-    yield "## States, faults, flags"
-    yield ""
-    for title, kind, table in (
-        ("A process is", ServiceState, STATES),
-        ("A sensor is", SensorState, SENSOR_STATES),
-        ("A channel is", FaultKind, FAULTS),
-    ):
-        yield f"| {title} | cause | remedy |\n|---|---|---|"
-        assert set(table) == set(kind), f"{kind.__name__} has a member without cause and remedy"
-        for one, (cause, remedy) in table.items():
-            yield f"| `{one.name}` | {cause} | {remedy} |"
-        yield ""
-    for title, kind, flags, path in (
-        ("An estimate is flagged", QualityFlag, FLAGS, "protos/palpate/messages/estimates.py"),
-        (
-            "A frame gets no estimate; the counter is",
-            EstimateRefusal,
-            REFUSALS,
-            "services/palpate_services/inference/estimates.py",
-        ),
-    ):
-        assert set(flags) == set(kind), f"{kind.__name__} has a member without a remedy"
-        docs = _member_docs(path, kind.__name__)
-        yield f"| {title} | cause | remedy |\n|---|---|---|"
-        for one, remedy in flags.items():
-            name = one.value if isinstance(one, str) else one.name
-            yield f"| `{name}` | {docs[one.name]} | {remedy} |"
-        yield ""
+def _table(title: str, kind: Iterable[Enum], causes: Causes) -> list[str]:
+    """Members of an enumeration with what causes them and what to do."""
+    assert set(causes) == set(kind), f"{title} ...: a member has no cause and remedy"
+    rows = [f"| `{name_of(one)}` | {' | '.join(causes[one])} |" for one in causes]
+    return [f"| {title} | cause | remedy |", "|---|---|---|", *rows, ""]
+
+
+def name_of(member: Enum) -> str:
+    """What a user meets: the name of a counter, else of the state."""
+    return member.value if isinstance(member, EstimateRefusal) else member.name
+
+
+def _states() -> list[str]:
+    flags = _member_docs("protos/palpate/messages/estimates.py", "QualityFlag")
+    refusals = _member_docs("services/palpate_services/inference/estimates.py", "EstimateRefusal")
+    causes: Causes = {one: (flags[one.name], remedy) for one, remedy in FLAGS.items()}
+    reasons: Causes = {one: (refusals[one.name], remedy) for one, remedy in REFUSALS.items()}
+    return [
+        "## States, faults, flags",
+        "",
+        *_table("A process is", ServiceState, STATES),
+        *_table("A sensor is", SensorState, SENSOR_STATES),
+        *_table("A channel is", FaultKind, FAULTS),
+        *_table("An estimate is flagged", QualityFlag, causes),
+        *_table("A frame gets no estimate; the counter is", EstimateRefusal, reasons),
+    ]
 
 
 def page() -> str:
@@ -413,32 +419,26 @@ def page() -> str:
     code = modules()
     classes = error_classes(code)
     made: dict[str, list[Failure]] = defaultdict(list)
-    for one in failures(code, classes):
-        made[one.error].append(one)
-    lines = [HEAD, *_states()]
-    lines += ["## Errors", ""]
+    for failure in failures(code, classes):
+        made[failure.error].append(failure)
+    lines = [HEAD, *_states(), "## Errors", ""]
     lines += ["| error | is also | code | means | places |", "|---|---|---|---|---|"]
     for name, one in classes.items():
         bases = ", ".join(f"`{base}`" for base in one.bases)
         link = f"[{name}](#{name.lower()})" if made[name] else f"`{name}`"
-        lines.append(
-            f"| {link} | {bases} | `{one.code}` | {_meaning(one.meaning)} | {len(made[name])} |"
-        )
+        cells = [link, bases, f"`{one.code}`", _meaning(one.meaning), str(len(made[name]))]
+        lines.append(f"| {' | '.join(cells)} |")
     lines.append("")
     for name, one in classes.items():
         if not made[name]:
             continue
         lines += [f"## {name}", "", _meaning(one.meaning), ""]
         lines += ["| it says | remedy | from |", "|---|---|---|"]
-        seen = set()
-        for failure in made[name]:
-            row = (
-                f"| {_cell(failure.problem)} | {_cell(failure.remedy or '')} | `{failure.module}` |"
-            )
-            if row not in seen:
-                seen.add(row)
-                lines.append(row)
-        lines.append("")
+        rows = [
+            f"| {_cell(failure.problem)} | {_cell(failure.remedy or '')} | `{failure.module}` |"
+            for failure in made[name]
+        ]
+        lines += [*dict.fromkeys(rows), ""]
     return "\n".join(lines)
 
 

@@ -54,7 +54,13 @@ html_copy_source = False
 SECTIONS = {
     "Start": ["docs/quick-start", "docs/install", "docs/first-biotac"],
     "Guides": ["docs/guides/*"],
-    "Concepts": ["docs/concepts/*", "docs/conventions", "docs/tare-and-health", "docs/time"],
+    "Concepts": [
+        "docs/concepts/*",
+        "docs/conventions",
+        "docs/tare-and-health",
+        "docs/time",
+        "docs/comparison",
+    ],
     "Experiment and models": ["docs/twin", "docs/testbed", "docs/models", "docs/simulation-store"],
     "Operate": [
         "docs/operations",

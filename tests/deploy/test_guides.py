@@ -141,7 +141,8 @@ class Terminal:
 @contextmanager
 def terminal(folder: Path, port: int) -> Iterator[Terminal]:
     """A folder like a checkout, and commands that meet on a router of their own."""
-    (folder / "docs").symlink_to(ROOT / "docs")
+    for part in ("docs", "training"):
+        (folder / part).symlink_to(ROOT / part)
     endpoint = f"tcp/127.0.0.1:{port}"
     data = ROOT.parent / "shared" / "data"
     environment = {
@@ -205,9 +206,10 @@ def test_commands_of_a_page_do_what_it_says(
     printed = ""
     with terminal(tmp_path, new_port()) as commands:
         for block in blocks_of(path.read_text(encoding="utf-8")):
-            if block.mark == "needs data" and not (
-                ROOT.parent / "shared" / "data" / block.says
-            ).is_dir():
+            if (
+                block.mark == "needs data"
+                and not (ROOT.parent / "shared" / "data" / block.says).is_dir()
+            ):
                 pytest.skip(f"the rest needs ../shared/data/{block.says}")
             if block.mark == "file":
                 file = tmp_path / block.says
