@@ -20,7 +20,8 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / room) for room in ("protos", "fem", "training")]
 
 project = "palpate"
-copyright = "palpate authors, Apache-2.0"
+author = "the palpate authors"
+copyright = "the palpate authors, Apache-2.0"
 html_title = "palpate"
 language = "en"
 root_doc = "README"
@@ -32,7 +33,7 @@ exclude_patterns += ["node_modules"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_heading_anchors = 6  # those of a code host, so that links with # work in both places
 myst_enable_extensions = ["dollarmath"]
-nitpicky = False
+default_role = "code"  # in docstrings, as in Markdown
 suppress_warnings = ["myst.header"]  # some pages begin a list of sections below a picture
 
 autodoc_member_order = "bysource"
