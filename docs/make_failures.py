@@ -422,11 +422,11 @@ def page() -> str:
     for failure in failures(code, classes):
         made[failure.error].append(failure)
     lines = [HEAD, *_states(), "## Errors", ""]
-    lines += ["| error | is also | code | means | places |", "|---|---|---|---|---|"]
+    lines += ["| error | is also | code | means |", "|---|---|---|---|"]
     for name, one in classes.items():
         bases = ", ".join(f"`{base}`" for base in one.bases)
         link = f"[{name}](#{name.lower()})" if made[name] else f"`{name}`"
-        cells = [link, bases, f"`{one.code}`", _meaning(one.meaning), str(len(made[name]))]
+        cells = [link, bases, f"`{one.code}`", _meaning(one.meaning)]
         lines.append(f"| {' | '.join(cells)} |")
     lines.append("")
     for name, one in classes.items():
