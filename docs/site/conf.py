@@ -62,7 +62,13 @@ SECTIONS = {
         "docs/time",
         "docs/comparison",
     ],
-    "Experiment and models": ["docs/twin", "docs/testbed", "docs/models", "docs/simulation-store"],
+    "Experiment and models": [
+        "docs/twin",
+        "docs/testbed",
+        "docs/data",
+        "docs/models",
+        "docs/simulation-store",
+    ],
     "Operate": [
         "docs/operations",
         "docs/failures",
