@@ -7,6 +7,7 @@ import ipaddress
 import os
 import re
 from collections.abc import Mapping
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -73,6 +74,21 @@ class StrictConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", str_strip_whitespace=True)
 
 
+class Role(StrEnum):
+    """What a holder of a certificate is for; ``palpate.bus.access`` says what each may do."""
+
+    ROUTER = "router"
+    GATEWAY = "gateway"
+    SERVICE = "service"
+    ROBOT = "robot"
+    OPERATOR = "operator"
+
+    @property
+    def common_name(self) -> str:
+        """Common name of its certificates: Zenoh compares whole names, without wildcards."""
+        return f"palpate-{self.value}"
+
+
 TLS_FILES = {
     "root_ca_certificate": "ca.pem",
     "certificate": "cert.pem",
@@ -82,11 +98,20 @@ TLS_FILES = {
 
 
 class TlsConfig(StrictConfig):
-    """Certificates for mutual TLS (Zenoh ``transport/link/tls``)."""
+    """Certificates for mutual TLS (Zenoh ``transport/link/tls``).
+
+    Attributes:
+        root_ca_certificate: Certificate of the authority that issued all others.
+        certificate: This process's own.
+        private_key: Its key.
+        roles: Whether what others may do follows from the role in their certificate, as
+            ``palpate certs`` writes it; False = whoever has a certificate may do everything.
+    """
 
     root_ca_certificate: Path
     certificate: Path
     private_key: Path
+    roles: bool = True
 
     @classmethod
     def of_folder(cls, folder: str | Path) -> TlsConfig:
@@ -100,7 +125,8 @@ class TlsConfig(StrictConfig):
             if not path.is_file():
                 raise ConfigError(
                     f"{path} does not exist",
-                    remedy=f"name a folder that holds {', '.join(TLS_FILES.values())}",
+                    remedy=f"name a folder that holds {', '.join(TLS_FILES.values())}: "
+                    "palpate certs issue makes it",
                 )
         return cls(**paths)
 
@@ -129,10 +155,16 @@ class RouterOptions(StrictConfig):
             raise ValueError("tls is for the router that connect names, and connect is empty")
         return self
 
-    def changed(self, link: LinkConfig, **changes: object) -> LinkConfig:
-        """A link with this router, if one is named, and with other changes."""
+    def changed(self, link: LinkConfig, *, roles: bool = True, **changes: object) -> LinkConfig:
+        """A link with this router, if one is named, and with other changes.
+
+        ``roles`` False: those who join that router, e.g. ROS, have no roles of palpate.
+        """
         if self.connect:
-            changes |= {"connect": (self.connect,), "tls": self.tls}
+            tls = self.tls
+            if tls is not None and not roles:
+                tls = tls.model_copy(update={"roles": False})
+            changes |= {"connect": (self.connect,), "tls": tls}
         return link.model_copy(update=changes)
 
 
@@ -150,6 +182,8 @@ class LinkConfig(StrictConfig):
         wall_clock_error_s: How far the wall clock of another host may be from this host's [s]. A
             reading that seems to come from farther in the future is refused.
         tls: Certificates; required for any listener that is not loopback.
+        certificates: Instead of ``tls``: a folder with a folder of certificates for each role that
+            runs on this host, as ``palpate certs`` makes it.
     """
 
     connect: tuple[str, ...] = (DEFAULT_ROUTER,)
@@ -159,6 +193,15 @@ class LinkConfig(StrictConfig):
     lease_s: float = Field(default=2.0, gt=0.1, le=600.0, allow_inf_nan=False)
     wall_clock_error_s: float = Field(default=0.05, ge=0, le=10, allow_inf_nan=False)
     tls: TlsConfig | None = None
+    certificates: Path | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _links_have_certificates(cls, values: Any) -> Any:
+        """Where certificates tell who somebody is, direct links have them, too."""
+        if isinstance(values, dict) and "listen" not in values and _has_roles(values):
+            return {**values, "listen": ("tls/127.0.0.1:0",)}
+        return values
 
     @field_validator("connect", "listen")
     @classmethod
@@ -167,16 +210,51 @@ class LinkConfig(StrictConfig):
             endpoint_host_port(endpoint)
         return value
 
+    @property
+    def has_tls(self) -> bool:
+        """Whether there are certificates, of this process or for each role."""
+        return self.tls is not None or self.certificates is not None
+
+    @property
+    def has_roles(self) -> bool:
+        """Whether certificates say what others may do."""
+        return self.certificates is not None or (self.tls is not None and self.tls.roles)
+
     @model_validator(mode="after")
     def _exposed_listener_needs_tls(self) -> LinkConfig:
+        if self.tls is not None and self.certificates is not None:
+            raise ValueError("tls and certificates exclude one another: set one of them")
         for endpoint in self.listen:
             host, _ = endpoint_host_port(endpoint)
-            if not is_loopback(host) and (self.tls is None or not endpoint.startswith("tls/")):
+            if not is_loopback(host) and not (self.has_tls and endpoint.startswith("tls/")):
                 raise ValueError(
                     f"listener {endpoint!r} is reachable from other hosts without mutual TLS: "
                     "use tls/HOST:PORT with [link.tls] certificates, or listen on 127.0.0.1"
                 )
+            if self.has_roles and not endpoint.startswith("tls/"):
+                raise ValueError(
+                    f"listener {endpoint!r} asks for no certificate, so that whoever comes has no "
+                    "role: use tls/HOST:PORT, or tls.roles = false"
+                )
         return self
+
+    def as_role(self, role: Role) -> LinkConfig:
+        """The link of a process with this role: with its certificates from ``certificates``.
+
+        Raises:
+            ConfigError: That folder has none for the role.
+        """
+        if self.certificates is None:
+            return self
+        tls = TlsConfig.of_folder(self.certificates.expanduser() / role.value)
+        return self.model_copy(update={"tls": tls, "certificates": None})
+
+
+def _has_roles(values: Mapping[str, Any]) -> bool:
+    """Whether the values of a link have certificates with roles, before they are checked."""
+    tls = values.get("tls")
+    roles = tls.get("roles", True) if isinstance(tls, Mapping) else getattr(tls, "roles", False)
+    return values.get("certificates") is not None or (tls is not None and bool(roles))
 
 
 CONNECT_VARIABLE = "PALPATE_CONNECT"

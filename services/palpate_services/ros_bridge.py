@@ -72,7 +72,7 @@ def run_ros_bridge(
     health = Health(SERVICE, instance)
     with (
         Session.open(link, station=station) as session,
-        Session.open(config.changed(link, direct=False)) as ros,
+        Session.open(config.changed(link, roles=False, direct=False)) as ros,
         RosBridge(ros, config) as bridge,
         session.tap([FEATURES, WRENCH], delivery=Delivery.QUEUE, capacity=config.capacity) as tap,
     ):

@@ -12,6 +12,7 @@ import typer
 
 from palpate_deploy.cli import data as training
 from palpate_deploy.cli.bench import bench_app
+from palpate_deploy.cli.certs import certs_app
 from palpate_deploy.cli.files import bundle_app, register
 from palpate_deploy.cli.models import StationProfileOption, TokenOption, model_app
 from palpate_deploy.cli.options import (
@@ -390,6 +391,7 @@ def echo(
 app.add_typer(topic_app, name="topic")
 app.add_typer(model_app, name="model")
 app.add_typer(bundle_app, name="bundle")
+app.add_typer(certs_app, name="certs")
 app.add_typer(bench_app, name="bench")
 register(app)
 app.add_typer(fem_app, name="fem")

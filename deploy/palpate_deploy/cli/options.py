@@ -99,10 +99,15 @@ def station_link(
     """Link and name of a station: those of a profile where the options have their defaults."""
     if profile is None:
         return client_link(connect, tls), station
+    from palpate.config import Role, TlsConfig
     from palpate_deploy.station.profile import load_profile
 
     loaded = load_profile(profile)
-    link = loaded.link.model_copy(update={"wait_for_router_s": ROUTER_WAIT_S})
+    link = loaded.link
+    if tls is not None and link.has_tls:  # another role than the operator's, or another folder
+        link = link.model_copy(update={"tls": TlsConfig.of_folder(tls), "certificates": None})
+    link = link.as_role(Role.OPERATOR)
+    link = link.model_copy(update={"wait_for_router_s": ROUTER_WAIT_S})
     if connect != DEFAULT_CONNECT:
         link = client_link(connect, tls or (link.tls if connect.startswith("tls/") else None))
     return link, loaded.station if station == DEFAULT_STATION else station

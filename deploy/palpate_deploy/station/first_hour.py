@@ -24,6 +24,7 @@ from palpate.bus import Delivery, Session, Subscriber
 from palpate.bus.topics import ELECTRODES, FEATURES, POSE, WRENCH, Topic
 from palpate.client.estimates import ask_tare, ask_zero
 from palpate.client.models import ModelAdmin
+from palpate.config import Role
 from palpate.errors import LinkError, RemoteError, StreamTimeout, printable
 from palpate.messages import (
     ElectrodeFrame,
@@ -93,7 +94,7 @@ def walk(order: WalkOrder) -> None:
     profile = load_profile(order.path)
     console = Console()
     with _running(profile, console) as run:
-        with join(profile, wait_s=_READY_S) as session:
+        with join(profile, wait_s=_READY_S, role=Role.OPERATOR) as session:
             console.print("tare: let go of the finger", markup=False)
             tare = tare_finger(session)
             if any(sensor.name == WRENCH_SENSOR for sensor in profile.gateway.sensors):
@@ -115,7 +116,7 @@ def walk(order: WalkOrder) -> None:
             )
         else:
             calibrate_finger(
-                profile.link,
+                profile.link.as_role(Role.OPERATOR),
                 profile.station,
                 CalibrationOrder(FINGER, order.presses, order.records, None, "", serve=True),
                 token=None,

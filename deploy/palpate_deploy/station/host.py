@@ -14,7 +14,7 @@ from typing import Any
 import tomli_w
 
 from palpate.bus import Session
-from palpate.config import endpoint_host_port
+from palpate.config import Role, endpoint_host_port
 from palpate.errors import ConfigError, LinkError
 from palpate.process import state_folder
 from palpate_deploy.station.profile import Profile, changed, load_profile, plain_values
@@ -67,13 +67,14 @@ def private_profile(name: str, **tables: Mapping[str, Any]) -> Profile:
     return changed(load_profile(name), router={"listen": here}, link={"connect": here}, **own)
 
 
-def join(profile: Profile, *, wait_s: float) -> Session:
+def join(profile: Profile, *, wait_s: float, role: Role = Role.SERVICE) -> Session:
     """Join a profile's station; ``wait_s`` is the wait for its router [s], negative = no limit.
 
     Raises:
+        ConfigError: Its folder of certificates has none for the role.
         LinkError: There is no router.
     """
-    link = profile.link.model_copy(update={"wait_for_router_s": wait_s})
+    link = profile.link.as_role(role).model_copy(update={"wait_for_router_s": wait_s})
     return Session.open(link, station=profile.station)
 
 

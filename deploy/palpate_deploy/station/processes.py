@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Self
 
+from palpate.config import Role
 from palpate.errors import ConfigError, PalpateError
 from palpate.process import check_installed
 from palpate_deploy.station import logs
@@ -63,18 +64,26 @@ def run_service(service: Service, profile: Profile) -> None:
     _log.info("%s ends", service)
 
 
+def role_of(service: Service) -> Role:
+    """The role that a process has in its certificate."""
+    if service == "router":
+        return Role.ROUTER
+    return Role.GATEWAY if service == "gateway" else Role.SERVICE
+
+
 def _run(service: Service, profile: Profile, stop: threading.Event) -> None:
+    link = profile.link.as_role(role_of(service))
     if service == "router":
         from palpate.bus import run_router
 
-        run_router(profile.router.listen, stop, link=profile.link)
+        run_router(profile.router.listen, stop, link=link)
         return
     if service == "gateway" and profile.gateway.pace != "fast":
         from palpate_gateway.one_core import stay_on_one_core
 
         stay_on_one_core(profile.gateway.core)
     run = _entry_point(service, profile)
-    run(getattr(profile, service), profile.link, profile.station, stop)
+    run(getattr(profile, service), link, profile.station, stop)
 
 
 def _entry_point(service: Service, profile: Profile) -> Callable[..., None]:

@@ -69,7 +69,7 @@ class RouterConfig(StrictConfig):
     """Where the router listens.
 
     Attributes:
-        listen: Endpoints; any that is not loopback needs ``[link.tls]``.
+        listen: Endpoints; any that is not loopback needs certificates: ``[link] certificates``.
     """
 
     listen: tuple[str, ...] = (DEFAULT_ROUTER,)
@@ -327,9 +327,15 @@ def _check_router(profile: Profile, where: str) -> None:
     for endpoint in profile.router.listen:
         host, _ = endpoint_host_port(endpoint)
         exposed = not is_loopback(host)
-        if exposed and (profile.link.tls is None or not endpoint.startswith("tls/")):
+        if exposed and not (profile.link.has_tls and endpoint.startswith("tls/")):
             raise ConfigError(
                 f"{where}: router.listen {endpoint!r} is reachable from other hosts without "
                 "mutual TLS",
-                remedy="use tls/HOST:PORT with [link.tls] certificates, or listen on 127.0.0.1",
+                remedy="use tls/HOST:PORT and [link] certificates, or listen on 127.0.0.1",
+            )
+        if profile.link.has_roles and not endpoint.startswith("tls/"):
+            raise ConfigError(
+                f"{where}: router.listen {endpoint!r} asks for no certificate, so that whoever "
+                "comes has no role",
+                remedy="use tls/HOST:PORT",
             )

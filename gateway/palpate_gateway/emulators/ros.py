@@ -121,7 +121,10 @@ class RosEmulator(RoutedEmulator):
         """The message of what is measured at a time of the emulator's own [s]."""
 
     def _join(self) -> None:
-        link = self._link().model_copy(update={"direct": False})
+        link = self._link()
+        if link.tls is not None:
+            link = link.model_copy(update={"tls": link.tls.model_copy(update={"roles": False})})
+        link = link.model_copy(update={"direct": False})
         self._session = session = Session.open(link)
         name = self.topic.strip("/")
         head = f"@ros2_lv/{self.domain}/{session.zid}/0"

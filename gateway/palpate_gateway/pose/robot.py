@@ -72,8 +72,9 @@ class PoseZenoh(BusDevice):
     def join(self, link: LinkConfig, station: str) -> None:
         """See ``BusDevice``; the options take precedence."""
         options = self._options
-        own = LinkConfig()
-        self._link = options.changed(link, wait_for_router_s=options.timeout_s, listen=own.listen)
+        link = options.changed(link, wait_for_router_s=options.timeout_s)
+        own = LinkConfig(tls=link.tls)
+        self._link = link.model_copy(update={"listen": own.listen})
         self._station = options.station or station
 
     def _open(self) -> DeviceIdentity:

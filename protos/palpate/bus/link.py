@@ -15,6 +15,7 @@ from typing import Any, Self, TypeVar
 
 import zenoh
 
+from palpate.bus import access
 from palpate.bus.attachments import OnTimings
 from palpate.bus.claims import ClaimWatch, SensorClaims
 from palpate.bus.delivery import Delivery
@@ -28,7 +29,7 @@ from palpate.bus.ring import Alarm
 from palpate.bus.tap import Tap
 from palpate.bus.topics import MAX_MESSAGE_BYTES, Topic, caller_key, sensor_key, service_key
 from palpate.config import LinkConfig, check_name
-from palpate.errors import LinkError, PalpateError
+from palpate.errors import ConfigError, LinkError, PalpateError
 from palpate.process import Closing
 
 INDIRECT_WAIT_S = 60.0
@@ -45,7 +46,12 @@ LOSSLESS_STALL_S = 60.0
 
 
 def zenoh_config(link: LinkConfig, mode: str) -> zenoh.Config:
-    """Settings of a session of ``mode`` ``"peer"``, ``"client"`` or ``"router"``."""
+    """Settings of a session of ``mode`` ``"peer"``, ``"client"`` or ``"router"``.
+
+    Raises:
+        ConfigError: A router is to be reached without certificates, although roles are asked for.
+    """
+    _check_certificates(link)
     client = mode == "client"
     wait_s = INDIRECT_WAIT_S if link.wait_for_router_s < 0 else link.wait_for_router_s
     settings: dict[str, Any] = {
@@ -106,8 +112,26 @@ def zenoh_config(link: LinkConfig, mode: str) -> zenoh.Config:
             "listen_private_key": str(link.tls.private_key),
             "connect_certificate": str(link.tls.certificate),
             "connect_private_key": str(link.tls.private_key),
+            # A certificate that has expired ends the links that it opened, too.
+            "close_link_on_expiration": True,
         }
+        if link.tls.roles:
+            settings |= access.settings()
     return zenoh.Config.from_json5(json.dumps(settings))
+
+
+def _check_certificates(link: LinkConfig) -> None:
+    if link.certificates is not None:
+        raise ConfigError(
+            f"{link.certificates} holds certificates by role, and this process has no role",
+            remedy="name the folder of one role: --tls FOLDER/operator",
+        )
+    plain = [end for end in link.connect if not end.startswith("tls/")]
+    if link.has_roles and plain:
+        raise ConfigError(
+            f"{plain[0]} shows no certificate, so that nothing it says would be believed",
+            remedy=f"connect to tls/{plain[0].partition('/')[2]}, or set tls.roles = false",
+        )
 
 
 _IN_USE = re.compile(r"Address already in use|EADDRINUSE|os error 98|os error 48")
@@ -402,7 +426,7 @@ class Session(Closing):
                 everyone=True,
                 on_timings=on_timings,
             )
-            return first_reply(list(replies), lambda: no_reply(asking, key))
+            return first_reply(list(replies), lambda: self._no_reply(asking, key))
 
         return ask_again(once, timeout_s)
 
@@ -441,7 +465,10 @@ class Session(Closing):
         key = self._key(endpoint, sensor, service, instance)
         asking = self._asking()
         replies = ask(asking, key, endpoint, request, timeout_s=timeout_s, everyone=False)
-        return raise_errors(replies, lambda: no_reply(asking, key))
+        return raise_errors(replies, lambda: self._no_reply(asking, key))
+
+    def _no_reply(self, asking: zenoh.Session, key: str) -> LinkError:
+        return no_reply(asking, key, roles=self._link.has_roles)
 
     def caller_token(self, request_id: str) -> CallerToken:
         """Show that this process waits for an answer, until it is closed or this process dies."""

@@ -263,11 +263,18 @@ def raise_errors(
         raise silence()
 
 
-def no_reply(session: zenoh.Session, key: str) -> LinkError:
+def no_reply(session: zenoh.Session, key: str, *, roles: bool = False) -> LinkError:
     """The error for a question that had no reply at all: nobody serves it, or the reply was lost.
 
-    Zenoh tells neither; whether somebody serves the key is looked up here.
+    Zenoh tells neither; whether somebody serves the key is looked up here. With ``roles`` the
+    question may also have been refused on its way, of which Zenoh does not tell either.
     """
+    if roles and _served(session, key):
+        return LinkError(
+            f"{key} is served, but no answer arrived: the role of this certificate may not ask it, "
+            f"it ended while it worked on the question, or its answer is {_DROPPED}",
+            remedy="docs/security.md lists what each role may ask; palpate certs show tells yours",
+        )
     if _served(session, key):
         return LinkError(
             f"{key} is served, but no answer arrived: it ended while it worked on the question, "
