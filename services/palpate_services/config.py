@@ -24,10 +24,13 @@ class ModelsConfig(StrictConfig):
             folder of whoever runs the process.
         state: Where a station remembers what it serves, and keeps its admin token; None = palpate's
             state folder of whoever runs the process.
+        trusted_keys: Public keys, as ``palpate model key`` makes them. With any, only bundles that
+            one of them has signed are imported and served, beside those that ship with palpate.
     """
 
     folder: _UserPath | None = None
     state: _UserPath | None = None
+    trusted_keys: tuple[_UserPath, ...] = Field(default=(), max_length=64)
 
     @property
     def repository_folder(self) -> Path:

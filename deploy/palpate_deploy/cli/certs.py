@@ -56,13 +56,16 @@ def issue(
     days: Annotated[int, typer.Option(min=1, max=36500, help="Validity [days].")] = 365,
 ) -> None:
     """Issue a certificate for one role: a folder with ca.pem, cert.pem, key.pem."""
+    from palpate.config import TlsConfig
     from palpate.process import require
 
     require("cryptography", extra="security")
     from palpate_deploy.station.certificates import issue as make
     from palpate_deploy.station.certificates import read_certificate
 
-    made = read_certificate(make(folder, role, name, host or (), days=days))
+    made = read_certificate(
+        TlsConfig.of_folder(make(folder, role, name, host or (), days=days))
+    )
     print(f"{made.folder}: {role}, valid until {made.until:%Y-%m-%d}, for {', '.join(made.hosts)}")
 
 

@@ -66,7 +66,7 @@ def verify(
     from palpate_deploy.station.models import verify_model
     from palpate_deploy.station.profile import load_profile
 
-    verify_model(bundle, load_profile(profile).models.repository_folder)
+    verify_model(bundle, load_profile(profile).models)
 
 
 @model_app.command(epilog=example("palpate model card field-twin"))
@@ -90,7 +90,30 @@ def import_(
     from palpate_deploy.station.models import import_model
     from palpate_deploy.station.profile import load_profile
 
-    import_model(folder, load_profile(profile).models.repository_folder)
+    import_model(folder, load_profile(profile).models)
+
+
+@model_app.command(epilog=example("palpate model key lab-signing.key"))
+def key(
+    file: Annotated[Path, typer.Argument(help="New file of the private key.")],
+) -> None:
+    """Make a key that signs bundles; stations are told its public half, FILE.pub."""
+    from palpate.files.signature import make_signing_key
+
+    public = make_signing_key(file)
+    print(f"{file}: keep it secret, off the station")
+    print(f"{public}: for each station's profile: [models] trusted_keys = [\"{public}\"]")
+
+
+@model_app.command(epilog=example("palpate model sign runs/bundle/2 --key lab-signing.key"))
+def sign(
+    folder: Annotated[Path, typer.Argument(help="Folder of the bundle.")],
+    key: Annotated[Path, typer.Option(help="File of the private key.")],
+) -> None:
+    """Check a bundle and sign it; its signature is copied when it is imported."""
+    from palpate_deploy.station.models import sign_model
+
+    sign_model(folder, key)
 
 
 @model_app.command(epilog=example("palpate model served", "palpate model served --json"))

@@ -19,10 +19,10 @@ from rich.console import Console
 
 from palpate.config import endpoint_host_port, is_loopback
 from palpate.errors import LinkError, PalpateError
-from palpate.process import state_folder
+from palpate.process import check_installed, state_folder
 from palpate_deploy.station.host import check_free, join
 from palpate_deploy.station.logs import FAILED
-from palpate_deploy.station.processes import check_packages
+from palpate_deploy.station.processes import check_packages, role_of
 from palpate_deploy.station.profile import Profile, load_profile
 
 Grade = Literal["ok", "warn", "fail"]
@@ -155,12 +155,33 @@ def _router(profile: Profile) -> Found:
         check_free(profile.router.listen)
     except LinkError as error:
         return "fail", f"{error.problem} by another program", error.remedy
-    exposed = [e for e in profile.router.listen if not is_loopback(endpoint_host_port(e)[0])]
-    if exposed and profile.link.tls is not None:
-        for path in (profile.link.tls.root_ca_certificate, profile.link.tls.certificate):
-            if not path.is_file():
-                return "fail", f"{path} does not exist", "set [link.tls]"
     return "ok", f"not running; port free at {', '.join(profile.router.listen)}", ""
+
+
+def _certificates(profile: Profile) -> Found:
+    link = profile.link
+    if not link.has_tls:
+        return "ok", "none: this station is reached from this host only", ""
+    check_installed("cryptography", extra="security")
+    from palpate_deploy.station.certificates import WARN_DAYS, read_certificate
+
+    roles = list(dict.fromkeys(role_of(service) for service in profile.processes))
+    ours = []
+    for role in roles:
+        tls = link.as_role(role).tls
+        assert tls is not None
+        one = read_certificate(tls)
+        if one.problem:
+            return "fail", f"{tls.certificate}: {one.problem}", "issue another: palpate certs issue"
+        if tls.roles and one.role is not role:
+            wrong = f"{tls.certificate} is that of a {one.role}, a {role} needs its own"
+            return "fail", wrong, "make a folder for each role: [link] certificates"
+        ours.append(one)
+    first = min(ours, key=lambda one: one.until)
+    found = f"{', '.join(roles)}: the first of them ends on {first.until:%Y-%m-%d}"
+    if first.days_left < WARN_DAYS:
+        return "warn", found, "issue new ones: palpate certs issue, and start the station again"
+    return "ok", found, ""
 
 
 def _bundle(profile: Profile) -> Found:
@@ -177,15 +198,14 @@ def _bundle(profile: Profile) -> Found:
     ]
     if not served:
         return "ok", "no service of this profile needs one", ""
-    from palpate.files.bundle import read_bundle
     from palpate_services.inference.model import load
     from palpate_services.inference.repository import Repository
     from palpate_services.inference.trial import proven
 
-    repository = Repository(profile.models.repository_folder)
+    repository = Repository.of_config(profile.models)
     names = []
     for task, name in served:
-        manifest = load(proven(read_bundle(repository.resolve(name)), task), task).manifest
+        manifest = load(proven(repository.read(repository.resolve(name)), task), task).manifest
         names.append(f"{manifest.name}:{manifest.version}")
     what = "reproduces its golden vectors" if len(names) == 1 else "reproduce their golden vectors"
     return "ok", f"{', '.join(names)} {what}", ""
@@ -268,6 +288,7 @@ _CHECKS: dict[str, Callable[[Profile], Found]] = {
     "extras": _extras,
     "sensors": _sensors,
     "router": _router,
+    "certificates": _certificates,
     "bundle": _bundle,
     "disk": _disk,
     "state": _state,

@@ -31,7 +31,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from palpate.bus.access import ROLE_OF
-from palpate.config import TLS_FILES, Role, check_name
+from palpate.config import TLS_FILES, Role, TlsConfig, check_name
 from palpate.errors import ConfigError
 
 AUTHORITY_KEY = "ca.key"
@@ -155,24 +155,25 @@ def issue(
     return target
 
 
-def read_certificate(folder: Path) -> IssuedCertificate:
-    """What the certificate in a folder says, and whether it holds.
+def read_certificate(tls: TlsConfig) -> IssuedCertificate:
+    """What a certificate says, and whether it holds.
 
     Raises:
         ConfigError: Its files cannot be read, or are no certificate and key.
     """
-    certificate, key = _read_pem(folder / _CERTIFICATE), _read_key(folder / _KEY)
-    authority = _read_pem(folder / AUTHORITY)
-    subject = certificate.subject
-    common = _first(subject, NameOID.COMMON_NAME)
+    certificate = _read_pem(tls.certificate)
+    common = _first(certificate.subject, NameOID.COMMON_NAME)
     role = ROLE_OF.get(common)
+    problem = _problem(certificate, tls)
+    if not problem and tls.roles and role is None:
+        problem = f"its common name {common!r} is no role"
     return IssuedCertificate(
-        folder,
+        tls.certificate.parent,
         role,
-        _first(subject, NameOID.ORGANIZATIONAL_UNIT_NAME) or common,
+        _first(certificate.subject, NameOID.ORGANIZATIONAL_UNIT_NAME) or common,
         _hosts(certificate),
         certificate.not_valid_after_utc,
-        _problem(folder, certificate, authority, key, role),
+        problem,
     )
 
 
@@ -182,37 +183,30 @@ def list_certificates(folder: Path) -> list[IssuedCertificate]:
     Raises:
         ConfigError: There is none, or one cannot be read.
     """
-    if (folder / _CERTIFICATE).exists():
-        return [read_certificate(folder)]
-    found = [read_certificate(path.parent) for path in sorted(folder.glob(f"*/{_CERTIFICATE}"))]
+    own = folder / _CERTIFICATE
+    paths = [own] if own.exists() else sorted(folder.glob(f"*/{_CERTIFICATE}"))
+    found = [read_certificate(TlsConfig.of_folder(path.parent)) for path in paths]
     if not found and not (folder / AUTHORITY).exists():
         raise ConfigError(f"{folder} holds no certificates", remedy=_REMEDY)
     return found
 
 
-def _problem(
-    folder: Path,
-    certificate: x509.Certificate,
-    authority: x509.Certificate,
-    key: PrivateKeyTypes,
-    role: Role | None,
-) -> str:
+def _problem(certificate: x509.Certificate, tls: TlsConfig) -> str:
+    authority, key = _read_pem(tls.root_ca_certificate), _read_key(tls.private_key)
     try:
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature):
-        return f"{AUTHORITY} is not the authority that issued it"
+        return f"{tls.root_ca_certificate.name} is not the authority that issued it"
     if _raw(key.public_key()) != _raw(certificate.public_key()):
-        return f"{_KEY} is not its key"
+        return f"{tls.private_key.name} is not its key"
     now = _now()
     for what, one in (("it", certificate), ("its authority", authority)):
         if one.not_valid_after_utc <= now:
             return f"{what} has ended on {one.not_valid_after_utc:%Y-%m-%d}"
         if one.not_valid_before_utc > now:
             return f"{what} begins on {one.not_valid_before_utc:%Y-%m-%d %H:%M} UTC: check the clock"
-    if role is None:
-        return "its common name is no role"
-    if stat.S_IMODE((folder / _KEY).stat().st_mode) & 0o077:
-        return f"others than its owner may read {_KEY}: chmod 600 {folder / _KEY}"
+    if stat.S_IMODE(tls.private_key.stat().st_mode) & 0o077:
+        return f"others than its owner may read the key: chmod 600 {tls.private_key}"
     return ""
 
 

@@ -17,6 +17,7 @@ from palpate.config import LinkConfig
 from palpate.errors import LinkError, PalpateError, printable
 from palpate.files.bundle import Bundle, read_bundle, read_manifest
 from palpate.files.card import model_card
+from palpate.files.signature import sign_bundle
 from palpate.messages import ModelAction, ModelInventory, ServedModel
 from palpate_deploy.station.logs import cell
 from palpate_deploy.station.profile import Profile
@@ -84,7 +85,7 @@ def list_models(folder: Path, *, as_json: bool) -> None:
     Console().print(table)
 
 
-def verify_model(name: str, folder: Path) -> None:
+def verify_model(name: str, kept: ModelsConfig) -> None:
     """Check a bundle as a service does before it serves it, and describe it.
 
     Raises:
@@ -92,7 +93,8 @@ def verify_model(name: str, folder: Path) -> None:
         BundleError: It breaks its contract.
         MissingExtraError: ONNX Runtime is not installed.
     """
-    bundle = _checked(Repository(folder).resolve(name))
+    repository = Repository.of_config(kept)
+    bundle = _checked(repository, repository.resolve(name))
     manifest = bundle.manifest
     rows = next(iter(bundle.golden.values())).shape[0]
     where = printable(str(bundle.folder))
@@ -112,20 +114,32 @@ def print_card(name: str, folder: Path) -> None:
     print(model_card(bundle.manifest, bundle.sha256), end="")
 
 
-def import_model(source: Path, folder: Path) -> None:
-    """Check a bundle and copy it into the repository's ``folder``; nothing serves it yet.
+def import_model(source: Path, kept: ModelsConfig) -> None:
+    """Check a bundle and copy it into the user's repository; nothing serves it yet.
 
     Raises:
         BundleError: It breaks its contract, or another one has its name and version.
         ConfigError: It cannot be copied.
     """
-    label, where = Repository(folder).add(source, _checked)
+    repository = Repository.of_config(kept)
+    label, where = repository.add(source, lambda copy: _checked(repository, copy))
     print(f"{label}  {printable(str(where))}")
     print(f"serve it: palpate model load {label}")
 
 
-def _checked(folder: Path) -> Bundle:
-    bundle = read_bundle(folder)
+def sign_model(folder: Path, key: Path) -> None:
+    """Sign a bundle, which is checked before.
+
+    Raises:
+        BundleError: It breaks its contract.
+        ConfigError: The key or the folder cannot be used.
+    """
+    bundle = _checked(Repository(None), folder)
+    print(f"{sign_bundle(bundle, key)}  {bundle.manifest.name}:{bundle.manifest.version}")
+
+
+def _checked(repository: Repository, folder: Path) -> Bundle:
+    bundle = repository.read(folder)
     load(proven(bundle, bundle.manifest.task), bundle.manifest.task)
     return bundle
 

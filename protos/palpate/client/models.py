@@ -75,7 +75,8 @@ class ModelAdmin:
         if not answers:
             raise LinkError(
                 f"no service {service!r} answers at station {self._session.station!r}",
-                remedy="start it: palpate up; see what runs: palpate status",
+                remedy="start it: palpate up; see what runs: palpate status; with certificates, "
+                "only those of an operator may ask",
             )
         obeyed = []
         for answer in answers:

@@ -375,6 +375,7 @@ def mesh_from_bytes(data: bytes, where: str) -> FieldMesh:
 
 MODEL, MANIFEST, GOLDEN, MESH = "model.onnx", "manifest.json", "golden.npz", "mesh.npz"
 RANGE = "range.npz"
+SIGNATURE = "signature.txt"
 _MODEL_BYTES_MAX = 256 << 20
 _MANIFEST_BYTES_MAX = 1 << 20
 _GOLDEN_BYTES_MAX = 64 << 20
@@ -385,6 +386,7 @@ _BYTES_MAX = {
     GOLDEN: _GOLDEN_BYTES_MAX,
     MESH: _MESH_BYTES_MAX,
     RANGE: RANGE_BYTES_MAX,
+    SIGNATURE: 1024,
 }
 """Size of each file, and of what its arrays expand to; those that ship have 1 % of it [bytes]."""
 

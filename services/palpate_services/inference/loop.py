@@ -490,7 +490,7 @@ def _models(
     if kept is None:
         return ServedModels(task, config, Repository(None)), None
     file = RememberedFile(kept.memory_folder / "stations" / station / f"{task}.{instance}.json")
-    models = ServedModels(task, config, Repository(kept.repository_folder), file)
+    models = ServedModels(task, config, Repository.of_config(kept), file)
     try:
         return models, make_token(token_file(kept.memory_folder, station))
     except ConfigError as error:

@@ -17,6 +17,7 @@ from palpate.files.bundle import (
     MESH,
     MODEL,
     RANGE,
+    SIGNATURE,
     Bundle,
     FieldMesh,
     read_bundle,
@@ -24,7 +25,9 @@ from palpate.files.bundle import (
     read_manifest,
     read_mesh,
 )
+from palpate.files.signature import TrustedKeys
 from palpate.process import data_folder
+from palpate_services.config import ModelsConfig
 
 _log = logging.getLogger(__name__)
 
@@ -33,6 +36,11 @@ _VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
 PACKAGED = Path(__file__).parent.parent / "models"
 """Bundles that ship with palpate: ``<name>/<version>/{model.onnx,manifest.json,golden.npz}``."""
+
+
+def ships(folder: Path) -> bool:
+    """Whether a bundle belongs to palpate's installation, which is trusted like its code."""
+    return folder.resolve().is_relative_to(PACKAGED.resolve())
 
 
 def available(models: Path = PACKAGED) -> list[str]:
@@ -53,11 +61,43 @@ class Repository:
     """Bundles by name and version: those that ship with palpate, and those in a user's folder.
 
     Both have the layout ``<name>/<version>/``. A version never changes and is never in both.
+
+    Args:
+        folder: The user's; None = only those that ship.
+        packaged: Those that ship.
+        trusted: Keys of which one must have signed each bundle that does not ship; None = none.
     """
 
-    def __init__(self, folder: Path | None, *, packaged: Path = PACKAGED) -> None:
+    def __init__(
+        self,
+        folder: Path | None,
+        *,
+        packaged: Path = PACKAGED,
+        trusted: TrustedKeys | None = None,
+    ) -> None:
         self.folder = folder
         self._folders = [packaged] if folder is None else [packaged, folder]
+        self._trusted = trusted or TrustedKeys()
+
+    @classmethod
+    def of_config(cls, models: ModelsConfig) -> Repository:
+        """The repository of a station.
+
+        Raises:
+            ConfigError: A trusted key cannot be read.
+        """
+        return cls(models.repository_folder, trusted=TrustedKeys(models.trusted_keys))
+
+    def read(self, folder: Path) -> Bundle:
+        """Read a bundle and check its digests and, where keys are trusted, its signature.
+
+        Raises:
+            BundleError: It is damaged, or its signature is missing or wrong.
+        """
+        bundle = read_bundle(folder)
+        if not ships(folder):
+            self._trusted.check(bundle)
+        return bundle
 
     @classmethod
     def of_user(cls) -> Repository:
@@ -135,6 +175,8 @@ class Repository:
         there = self._found().get((manifest.name, manifest.version))
         if there is not None:
             if read_bundle(there).sha256 == bundle.sha256:
+                if (copy / SIGNATURE).exists() and there == target:  # signed since then
+                    os.replace(copy / SIGNATURE, there / SIGNATURE)
                 return label, there
             raise BundleError(
                 f"another bundle {label} is in {there}, and bundles never change",
@@ -169,8 +211,8 @@ def _task_of(folder: Path) -> str | None:
 def _copied(source: Path, target: Path) -> Path:
     """Copy the files of a bundle, and nothing else that lies there."""
     target.mkdir()
-    for name in (MODEL, MANIFEST, GOLDEN, MESH, RANGE):
-        if name in (MESH, RANGE) and not (source / name).exists():
+    for name in (MODEL, MANIFEST, GOLDEN, MESH, RANGE, SIGNATURE):
+        if name in (MESH, RANGE, SIGNATURE) and not (source / name).exists():
             continue
         with open(target / name, "xb") as file:
             file.write(read_file(source, name))

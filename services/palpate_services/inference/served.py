@@ -19,7 +19,6 @@ from typing import NoReturn
 from palpate.admin import CommandGuard
 from palpate.bus import Session, endpoints
 from palpate.errors import BundleError, ConfigError, ErrorCode, PalpateError, RemoteError
-from palpate.files.bundle import read_bundle
 from palpate.health import Health
 from palpate.messages import (
     ModelAction,
@@ -287,7 +286,7 @@ class ServedModels:
         The bundle of the digest ``tried`` has served on this host: it needs no trial again.
         """
         folder = self._repository.resolve(source)
-        bundle = read_bundle(folder)
+        bundle = self._repository.read(folder)
         label = f"{bundle.manifest.name}:{bundle.manifest.version}"
         by_path = "/" in source or source.startswith(".")
         if not by_path and label != f"{folder.parent.name}:{folder.name}":

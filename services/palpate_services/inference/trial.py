@@ -19,7 +19,7 @@ from palpate.errors import BundleError, PalpateError, printable
 from palpate.files.bundle import Bundle, read_bundle
 from palpate.process import require
 from palpate_services.inference.model import load
-from palpate_services.inference.repository import PACKAGED
+from palpate_services.inference.repository import ships
 
 LIMIT_S = 5.0
 """Time to load, to compare with the golden vectors and to warm up [s]; those that ship need 0.2."""
@@ -33,11 +33,6 @@ _START_S = 30.0
 
 _REMEDY = "serve another bundle, or tell its maker"
 _NO_MEMORY = ("bad_alloc", "allocate memory", "bfc_arena")
-
-
-def ships(folder: Path) -> bool:
-    """Whether a bundle belongs to palpate's installation, which is trusted like its code."""
-    return folder.resolve().is_relative_to(PACKAGED.resolve())
 
 
 def proven(bundle: Bundle, task: str, *, limit_s: float = LIMIT_S) -> Bundle:
