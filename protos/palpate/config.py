@@ -128,7 +128,7 @@ class TlsConfig(StrictConfig):
                     remedy=f"name a folder that holds {', '.join(TLS_FILES.values())}: "
                     "palpate certs issue makes it",
                 )
-        return cls(**paths)
+        return cls.model_validate(paths)
 
 
 class RouterOptions(StrictConfig):

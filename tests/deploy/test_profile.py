@@ -39,7 +39,7 @@ def test_the_four_profiles_ship() -> None:
         ('statoin = "lab"', "'statoin'", "'station'"),
         ('[features]\nbundel = "x"', "'features.bundel'", "'bundle'"),
         ('[[gateway.sensors]]\nnam = "x"', "'gateway.sensors.0.nam'", "'name'"),
-        ('[link]\nzzz = "x"', "'link.zzz'", "known keys: connect"),
+        ('[link]\nzzz = "x"', "'link.zzz'", "known keys: certificates, connect"),
         ('[log]\nlevle = "info"', "'log.levle'", "'level'"),
     ],
 )

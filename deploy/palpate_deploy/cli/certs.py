@@ -63,9 +63,7 @@ def issue(
     from palpate_deploy.station.certificates import issue as make
     from palpate_deploy.station.certificates import read_certificate
 
-    made = read_certificate(
-        TlsConfig.of_folder(make(folder, role, name, host or (), days=days))
-    )
+    made = read_certificate(TlsConfig.of_folder(make(folder, role, name, host or (), days=days)))
     print(f"{made.folder}: {role}, valid until {made.until:%Y-%m-%d}, for {', '.join(made.hosts)}")
 
 

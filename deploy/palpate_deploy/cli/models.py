@@ -102,7 +102,7 @@ def key(
 
     public = make_signing_key(file)
     print(f"{file}: keep it secret, off the station")
-    print(f"{public}: for each station's profile: [models] trusted_keys = [\"{public}\"]")
+    print(f'{public}: for each station\'s profile: [models] trusted_keys = ["{public}"]')
 
 
 @model_app.command(epilog=example("palpate model sign runs/bundle/2 --key lab-signing.key"))

@@ -163,10 +163,14 @@ def _certificates(profile: Profile) -> Found:
     if not link.has_tls:
         return "ok", "none: this station is reached from this host only", ""
     check_installed("cryptography", extra="security")
-    from palpate_deploy.station.certificates import WARN_DAYS, read_certificate
+    from palpate_deploy.station.certificates import (
+        WARN_DAYS,
+        IssuedCertificate,
+        read_certificate,
+    )
 
     roles = list(dict.fromkeys(role_of(service) for service in profile.processes))
-    ours = []
+    ours: list[IssuedCertificate] = []
     for role in roles:
         tls = link.as_role(role).tls
         assert tls is not None
@@ -176,6 +180,9 @@ def _certificates(profile: Profile) -> Found:
         if tls.roles and one.role is not role:
             wrong = f"{tls.certificate} is that of a {one.role}, a {role} needs its own"
             return "fail", wrong, "make a folder for each role: [link] certificates"
+        if ours and one.authority != ours[0].authority:
+            wrong = f"{tls.certificate} and {ours[0].folder} are of different authorities"
+            return "fail", wrong, "issue all of them by one: palpate certs issue"
         ours.append(one)
     first = min(ours, key=lambda one: one.until)
     found = f"{', '.join(roles)}: the first of them ends on {first.until:%Y-%m-%d}"

@@ -62,6 +62,7 @@ class IssuedCertificate:
         name: Name of its holder.
         hosts: Names and addresses at which its holder may listen.
         until: When it ends, UTC.
+        authority: SHA-256 of the certificate of its authority, 32 bytes.
         problem: Why nobody will accept it, or that others may read its key; empty = all is well.
     """
 
@@ -70,6 +71,7 @@ class IssuedCertificate:
     name: str
     hosts: tuple[str, ...]
     until: datetime.datetime
+    authority: bytes
     problem: str = ""
 
     @property
@@ -173,6 +175,7 @@ def read_certificate(tls: TlsConfig) -> IssuedCertificate:
         _first(certificate.subject, NameOID.ORGANIZATIONAL_UNIT_NAME) or common,
         _hosts(certificate),
         certificate.not_valid_after_utc,
+        _read_pem(tls.root_ca_certificate).fingerprint(hashes.SHA256()),
         problem,
     )
 
@@ -204,7 +207,9 @@ def _problem(certificate: x509.Certificate, tls: TlsConfig) -> str:
         if one.not_valid_after_utc <= now:
             return f"{what} has ended on {one.not_valid_after_utc:%Y-%m-%d}"
         if one.not_valid_before_utc > now:
-            return f"{what} begins on {one.not_valid_before_utc:%Y-%m-%d %H:%M} UTC: check the clock"
+            return (
+                f"{what} begins on {one.not_valid_before_utc:%Y-%m-%d %H:%M} UTC: check the clock"
+            )
     if stat.S_IMODE(tls.private_key.stat().st_mode) & 0o077:
         return f"others than its owner may read the key: chmod 600 {tls.private_key}"
     return ""
@@ -255,8 +260,9 @@ def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateK
 
 
 def _read_pem(path: Path) -> x509.Certificate:
+    text = _read(path)
     try:
-        return x509.load_pem_x509_certificate(_read(path))
+        return x509.load_pem_x509_certificate(text)
     except ValueError as error:
         raise ConfigError(
             f"{path} is no certificate in PEM", remedy="issue it again: palpate certs issue"
@@ -264,8 +270,9 @@ def _read_pem(path: Path) -> x509.Certificate:
 
 
 def _read_key(path: Path) -> PrivateKeyTypes:
+    text = _read(path)
     try:
-        return load_pem_private_key(_read(path), password=None)
+        return load_pem_private_key(text, password=None)
     except (ValueError, TypeError) as error:  # damaged, or protected by a password
         raise ConfigError(
             f"{path} is no private key in PEM without password",

@@ -108,7 +108,9 @@ class RosSubscription(Generic[T]):
         """The gateway's own way to the bus; the options take precedence."""
         options = self._options
         # Through the router only: a client needs no listener, and every message takes one path.
-        self._link = options.changed(link, roles=False, direct=False, wait_for_router_s=options.timeout_s)
+        self._link = options.changed(
+            link, roles=False, direct=False, wait_for_router_s=options.timeout_s
+        )
 
     @property
     def counters(self) -> Mapping[str, int]:

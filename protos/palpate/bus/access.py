@@ -8,7 +8,7 @@ certificate of the lab may read; who may write is listed here for each key of ``
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -181,30 +181,23 @@ def _service_of(role: Role) -> str:
 
 
 def settings() -> dict[str, Any]:
-    """Zenoh's settings ``access_control`` and ``low_pass_filter`` of a process with certificates."""
-    rules = [
-        {
-            "id": f"{role}-{deed}",
-            "permission": "allow",
-            "flows": ["ingress"],
-            "messages": list(_MESSAGES[deed]),
-            "key_exprs": keys,
-        }
-        for role in Role
-        for deed, keys in rights(role).items()
-        if keys
-    ]
-    policies = [
-        {"rules": [rule["id"] for rule in rules if str(rule["id"]).startswith(f"{role}-")]
-         + ["out"], "subjects": [role.value]}
-        for role in Role
-    ]
-    subjects: list[dict[str, Any]] = [
-        {"id": role.value, "cert_common_names": [role.common_name]} for role in Role
-    ]
+    """Zenoh's settings of a process with certificates: who may do what, and how large it may be."""
+    rules: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
     every = [message for messages in _MESSAGES.values() for message in messages]
     # To whoever has a role everything may go out: what it may read is decided by what it asks for.
     rules.append(_rule("out", ["egress"], every, EVERY_KEY))
+    for role in Role:
+        own = [
+            _rule(f"{role} {deed}", ["ingress"], _MESSAGES[deed], keys)
+            for deed, keys in rights(role).items()
+            if keys
+        ]
+        rules += own
+        policies.append({"rules": ["out", *(rule["id"] for rule in own)], "subjects": [role.value]})
+    subjects: list[dict[str, Any]] = [
+        {"id": role.value, "cert_common_names": [role.common_name]} for role in Role
+    ]
     # The router's own door is a socket that only its user can reach.
     rules.append(_rule("door", ["ingress", "egress"], every, (f"{DOOR_ROOT}/**",)))
     subjects.append({"id": "door", "link_protocols": [DOOR_PROTOCOL]})
@@ -230,12 +223,14 @@ def log_refusals() -> None:
     zenoh.init_log_from_env_or(_LOG)
 
 
-def _rule(name: str, flows: list[str], messages: list[str], keys: tuple[str, ...]) -> dict[str, Any]:
+def _rule(
+    name: str, flows: list[str], messages: Sequence[str], keys: Sequence[str]
+) -> dict[str, Any]:
     return {
         "id": name,
         "permission": "allow",
         "flows": flows,
-        "messages": messages,
+        "messages": list(messages),
         "key_exprs": list(keys),
     }
 

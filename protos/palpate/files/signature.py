@@ -68,8 +68,9 @@ def sign_bundle(bundle: Bundle, key: Path) -> Path:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
+    text = _read_key(key)
     try:
-        loaded = load_pem_private_key(_read_key(key), password=None)
+        loaded = load_pem_private_key(text, password=None)
     except (ValueError, TypeError):
         loaded = None
     if not isinstance(loaded, Ed25519PrivateKey):
@@ -113,7 +114,9 @@ class TrustedKeys:
         label = f"bundle {bundle.manifest.name}:{bundle.manifest.version} in {bundle.folder}"
         if not os.path.lexists(bundle.folder / SIGNATURE):
             raise BundleError(f"{label} is not signed", remedy=_REMEDY)
-        head, _, text = read_file(bundle.folder, SIGNATURE).decode("ascii", "replace").partition(" ")
+        head, _, text = (
+            read_file(bundle.folder, SIGNATURE).decode("ascii", "replace").partition(" ")
+        )
         try:
             signature = bytes.fromhex(text) if head == _HEAD else b""
         except ValueError:
@@ -136,8 +139,9 @@ def _public_key(path: Path) -> Ed25519PublicKey:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
     from cryptography.hazmat.primitives.serialization import load_pem_public_key
 
+    text = _read_key(path)
     try:
-        key = load_pem_public_key(_read_key(path))
+        key = load_pem_public_key(text)
     except ValueError:
         key = None
     if not isinstance(key, Ed25519PublicKey):
