@@ -7,6 +7,9 @@ import json
 import shutil
 import ssl
 import stat
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
@@ -15,7 +18,8 @@ from typer.testing import CliRunner
 
 pytest.importorskip("cryptography")
 
-from palpate.config import Role, TlsConfig
+from palpate.bus import Session, run_router
+from palpate.config import LinkConfig, Role, TlsConfig
 from palpate.errors import ConfigError
 from palpate_deploy.cli.app import app
 from palpate_deploy.station import certificates
@@ -172,3 +176,35 @@ def test_a_profile_with_certificates_listens_with_them_only(lab: Path, tmp_path:
     assert "without mutual TLS" in " ".join(
         _run("up", "--print-config", "--profile", path, code=2).split()
     )
+
+
+@pytest.mark.slow
+def test_a_link_ends_with_the_certificate_that_opened_it(
+    lab: Path, new_port: Callable[[], int]
+) -> None:
+    then = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=1, seconds=-10)
+    with mock.patch.object(certificates, "_now", return_value=then):
+        issue(lab, Role.ROBOT, days=1)
+    endpoint = f"tls/127.0.0.1:{new_port()}"
+    link = LinkConfig(connect=(endpoint,), certificates=lab, wait_for_router_s=60, direct=False)
+    stop = threading.Event()
+    router = threading.Thread(
+        target=run_router,
+        args=((endpoint,), stop),
+        kwargs={"link": link.as_role(Role.ROUTER)},
+        daemon=True,
+    )
+    router.start()
+    try:
+        with (
+            Session.open(link.as_role(Role.SERVICE)) as service,
+            Session.open(link.as_role(Role.ROBOT)) as robot,
+        ):
+            deadline = time.monotonic() + 60
+            while robot.has_router():
+                assert time.monotonic() < deadline, "the link outlives its certificate"
+                time.sleep(0.1)
+            assert service.has_router(), "another link has ended, too"
+    finally:
+        stop.set()
+        router.join(60)

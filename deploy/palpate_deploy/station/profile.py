@@ -314,8 +314,13 @@ def _variable_of(loc: tuple[int | str, ...]) -> str | None:
 
 
 def _connect_to(listen: tuple[str, ...]) -> tuple[str, ...]:
-    """Endpoints at which this host reaches its router, which listens at ``listen``."""
-    return tuple(
+    """Endpoints at which this host reaches its router, which listens at ``listen``.
+
+    Where there is a listener of loopback beside others, it is for this host: nobody else can keep
+    that one busy (docs/security.md).
+    """
+    own = tuple(one for one in listen if is_loopback(endpoint_host_port(one)[0]))
+    return own or tuple(
         endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
         for endpoint in listen
     )

@@ -1,0 +1,634 @@
+"""Attacks on a station with certificates, each by what a stranger or a wrong role can really send.
+
+Each returns what came of it. ``tests/hostile/test_attacks.py`` asserts it, and
+``python -m docs.make_attacks`` writes it down.
+"""
+
+from __future__ import annotations
+
+import datetime
+import shutil
+import socket
+import ssl
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from unittest import mock
+
+import zenoh
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.x509.oid import NameOID
+from tests.hostile import bundles, records
+from tests.hostile.lab import LIVE_S, STATION, Heard, Lab, copy_of_bundle, raw, resident_bytes
+
+from palpate.admin import new_nonce, signed
+from palpate.bus import endpoints
+from palpate.bus.topics import SensorClaim, claim_key, sensor_key, service_key
+from palpate.client.estimates import ask_tare
+from palpate.client.models import ModelAdmin
+from palpate.codec import ERROR
+from palpate.config import Role
+from palpate.errors import PalpateError
+from palpate.files.bundle import read_bundle
+from palpate.files.record import check_readable, summarise
+from palpate.files.signature import sign_bundle
+from palpate.messages import ModelAction, ModelCommand, ModelInventory, ModelRequest
+from palpate_deploy.station import certificates
+from palpate_deploy.station.certificates import issue, make_authority
+from palpate_services.config import ModelsConfig
+from palpate_services.inference.repository import Repository
+
+QUIET_S = 1.0
+"""So long what must not arrive is waited for [s]."""
+
+FLOOD_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of an attack.
+
+    Attributes:
+        refused: Whether it had no effect.
+        says: What the attacker was told.
+        logged: Where the station tells of it: a line of a log or a counter; empty = nowhere.
+        numbers: What was measured.
+    """
+
+    refused: bool
+    says: str
+    logged: str
+    numbers: dict[str, float] = field(default_factory=dict)
+
+
+# --- links ---------------------------------------------------------------------------------------
+
+
+def no_certificate(lab: Lab) -> Outcome:
+    """A stranger who trusts the lab's authority shows no certificate."""
+    context = ssl.create_default_context(cafile=str(lab.certificates / "ca.pem"))
+    return _handshake(lab, context, "peer sent no certificates")
+
+
+def foreign_authority(lab: Lab) -> Outcome:
+    """A stranger shows an operator's certificate of an authority of his own."""
+    make_authority(lab.folder / "foreign")
+    issue(lab.folder / "foreign", Role.OPERATOR)
+    return _handshake(lab, _context(lab, lab.folder / "foreign" / "operator"), "invalid peer")
+
+
+def expired(lab: Lab) -> Outcome:
+    """An operator's certificate of the lab that ended yesterday."""
+    then = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=31)
+    with mock.patch.object(certificates, "_now", return_value=then):
+        folder = issue(lab.certificates, Role.OPERATOR, "former", days=30)
+    return _handshake(lab, _context(lab, folder), "invalid peer certificate")
+
+
+def no_encryption(lab: Lab) -> Outcome:
+    """A stranger speaks to the router without TLS."""
+    since = len(lab.log("router"))
+    with socket.create_connection(("127.0.0.1", lab.port), timeout=LIVE_S) as link:
+        link.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        with suppress(ConnectionError):
+            says = link.recv(100)
+    return Outcome(True, f"closed after {says!r}", lab.logged("router", "corrupt message", since))
+
+
+def _context(lab: Lab, folder: Path) -> ssl.SSLContext:
+    context = ssl.create_default_context(cafile=str(lab.certificates / "ca.pem"))
+    context.load_cert_chain(folder / "cert.pem", folder / "key.pem")
+    return context
+
+
+def _handshake(lab: Lab, context: ssl.SSLContext, words: str) -> Outcome:
+    """Whether a TLS client gets a byte from the router; with TLS 1.3 it reads to be refused."""
+    since = len(lab.log("router"))
+    try:
+        with (
+            socket.create_connection(("127.0.0.1", lab.port), timeout=LIVE_S) as link,
+            context.wrap_socket(link, server_hostname="localhost") as safe,
+        ):
+            safe.sendall(b"\x00" * 64)
+            got = safe.recv(100)
+        refused, says = not got, f"got {got!r}"
+    except (ssl.SSLError, ConnectionError) as error:
+        refused, says = True, str(error)
+    return Outcome(refused, says, lab.logged("router", words, since))
+
+
+def no_role(lab: Lab) -> Outcome:
+    """A certificate of the lab's authority whose common name is no role."""
+    folder = lab.certificates / "intern"
+    if not folder.exists():
+        _issue_without_role(lab, folder)
+    since = len(lab.log("router"))
+    with ExitStack() as stack:
+        heard = [
+            stack.enter_context(Heard(lab.operator, key))
+            for key in (_FRAMES, sensor_key(STATION, "arm", "robot_pose"))
+        ]
+        session = stack.enter_context(lab.join("intern", direct=False))
+        read = stack.enter_context(Heard(session, _FRAMES))
+        for key in (_FRAMES, sensor_key(STATION, "arm", "robot_pose")):
+            raw(session).put(key, _FORGED)
+        told = list(raw(session).get(_status_key("features"), timeout=2.0))
+        time.sleep(QUIET_S)
+        quiet = not any(_FORGED in one.payloads for one in heard)
+        quiet = quiet and set(read.payloads) <= {_FORGED}  # it hears itself
+    says = "frames and answers: none"
+    return Outcome(quiet and not told, says, lab.logged("router", "has no role", since))
+
+
+def _issue_without_role(lab: Lab, folder: Path) -> None:
+    """As ``issue`` does, with another common name."""
+    shutil.copytree(lab.certificates / "robot", folder)
+    authority, key = certificates._authority(lab.certificates)
+    template = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "intern")]))
+        .issuer_name(authority.subject)
+        .public_key(template.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(template.not_valid_before_utc)
+        .not_valid_after(template.not_valid_after_utc)
+    )
+    for one in template.extensions:
+        builder = builder.add_extension(one.value, one.critical)
+    made = builder.sign(key, hashes.SHA256())
+    (folder / "cert.pem").write_bytes(certificates._public(made))
+
+
+def only_loopback(lab: Lab) -> Outcome:
+    """Whoever looks for an open door: where do the station's processes listen?"""
+    found = [address for pid in lab.processes().values() for address in _listening(pid)]
+    outside = [one for one in found if not one.startswith("127.")]
+    says = f"{len(found)} listening sockets, {len(outside)} of them not on loopback"
+    return Outcome(bool(found) and not outside, says, "not needed", {"sockets": len(found)})
+
+
+def _listening(pid: int) -> Iterator[str]:
+    """Addresses at which a process listens, as ``/proc`` tells."""
+    inodes = set()
+    for one in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(OSError):
+            target = str(one.readlink())
+            if target.startswith("socket:["):
+                inodes.add(target[8:-1])
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            words = line.split()
+            if words[3] == "0A" and words[9] in inodes:
+                host, _, port = words[1].partition(":")
+                octets = [str(int(host[i : i + 2], 16)) for i in range(6, -1, -2)]
+                yield f"{'.'.join(octets) if table == 'tcp' else host}:{int(port, 16)}"
+
+
+def _joins_after_s(lab: Lab, endpoint: str) -> float:
+    """How long a robot's session takes to join at an endpoint [s]."""
+    began_s = time.monotonic()
+    with lab.join("robot", direct=False, connect=(endpoint,)):
+        return round(time.monotonic() - began_s, 1)
+
+
+def half_open_links(lab: Lab) -> Outcome:
+    """A stranger opens 200 connections to the router, says nothing on any, and hangs up."""
+    with ExitStack() as stack:
+        for _ in range(200):
+            link = socket.socket()
+            stack.callback(link.close)
+            link.settimeout(2.0)
+            with suppress(OSError):
+                link.connect(("127.0.0.1", lab.port))
+        before = lab.counter("features", "estimates_published")
+        silent_s = _joins_after_s(lab, lab.outside)
+    since = len(lab.log("router"))
+    # Zenoh 1.10 waits for 0.1 s after each handshake that fails, before it accepts another one.
+    numbers = {
+        "joins_while_silent_s": silent_s,
+        "joins_own_listener_s": _joins_after_s(lab, lab.endpoint),
+        "joins_same_listener_s": _joins_after_s(lab, lab.outside),
+    }
+    says = "who has joined is not disturbed; who joins at the same listener waits"
+    logged = lab.logged("router", "tls handshake eof", since)
+    return Outcome(_goes_on(lab, before), says, logged, numbers)
+
+
+# --- roles ---------------------------------------------------------------------------------------
+
+_FORGED = b"forged"
+_FRAMES = sensor_key(STATION, "finger", "electrodes")
+
+
+def _status_key(service: str) -> str:
+    return service_key(STATION, service, service, "status")
+
+
+def _forging(holder: str, *streams: str) -> Callable[[Lab], Outcome]:
+    def attack(lab: Lab) -> Outcome:
+        # The same role hears itself: that the message left is shown so.
+        keys = [sensor_key(STATION, "finger", stream) for stream in streams]
+        with ExitStack() as stack:
+            session = stack.enter_context(lab.join(holder))
+            heard = [stack.enter_context(Heard(lab.operator, key)) for key in keys]
+            time.sleep(QUIET_S)
+            for _ in range(20):
+                for key in keys:
+                    raw(session).put(key, _FORGED)
+                time.sleep(0.05)
+            time.sleep(QUIET_S)
+            reached = sum(one.payloads.count(_FORGED) for one in heard)
+        return Outcome(not reached, "nothing", "", {"sent": 20 * len(keys), "heard": reached})
+
+    attack.__doc__ = f"A {holder} publishes {', '.join(streams)}."
+    return attack
+
+
+def robot_tares(lab: Lab) -> Outcome:
+    """A robot tares a finger."""
+    key = sensor_key(STATION, "finger", "tare")
+    with Heard(lab.operator, key) as tares:
+        says = _error(lambda: ask_tare(lab.robot, "finger", frames=5, timeout_s=3.0))
+        time.sleep(QUIET_S)
+        return Outcome(bool(says) and not tares.payloads, says, "")
+
+
+def robot_loads(lab: Lab) -> Outcome:
+    """A robot that has stolen the admin token loads a model."""
+    before = _served(lab)
+    thief = ModelAdmin(lab.robot, lab.token)
+    says = _error(lambda: thief.load("features", "features-twin"))
+    return Outcome(bool(says) and _served(lab) == before, says, "")
+
+
+def robot_claims(lab: Lab) -> Outcome:
+    """A robot shows an older claim on a finger, to make its gateway give it up."""
+    claim = SensorClaim(STATION, "finger", 1, True, 1, "gateway", "thief", "X")
+    before = lab.counter("features", "estimates_published")
+    token = raw(lab.robot).liveliness().declare_token(claim_key(claim))
+    try:
+        time.sleep(3 * QUIET_S)
+        after = lab.counter("features", "estimates_published")
+    finally:
+        token.undeclare()
+    return Outcome(after > before + 20, "nothing", "", {"estimates_meanwhile": after - before})
+
+
+def robot_answers(lab: Lab) -> Outcome:
+    """A robot answers in the place of the features service."""
+    key = _status_key("features")
+    answer = raw(lab.robot).declare_queryable(key, lambda query: query.reply(key, _FORGED))
+    try:
+        time.sleep(QUIET_S)
+        found = [
+            reply.ok.payload.to_bytes()
+            for reply in raw(lab.operator).get(key, timeout=5.0)
+            if reply.ok is not None
+        ]
+    finally:
+        answer.undeclare()
+    return Outcome(_FORGED not in found, "nothing", "", {"answers": len(found)})
+
+
+def _served(lab: Lab) -> list[str]:
+    found = ModelAdmin(lab.operator, lab.token).served("features")
+    return [f"{one.name}:{one.version}" for answer in found for one in answer.served]
+
+
+def _error(call: Callable[[], object]) -> str:
+    """The typed error of a call; empty = it succeeded."""
+    try:
+        call()
+    except PalpateError as error:
+        return f"{type(error).__name__}: {error.problem}"
+    return ""
+
+
+# --- commands ------------------------------------------------------------------------------------
+
+
+def _command(
+    lab: Lab, *, wall_ns: int | None = None, bundle: str = "features-twin"
+) -> ModelCommand:
+    now = time.time_ns() if wall_ns is None else wall_ns
+    return ModelCommand(ModelAction.LOAD, STATION, "features", new_nonce(), now, bundle=bundle)
+
+
+def _give(lab: Lab, request: ModelRequest, *, by: str = "operator") -> list[object]:
+    session = lab.operator if by == "operator" else lab.robot
+    return session.query_all(
+        endpoints.MODELS, request, service="features", instance="features", timeout_s=LIVE_S
+    )
+
+
+def _refused_command(lab: Lab, request: ModelRequest, counter: str = "commands_denied") -> Outcome:
+    before, count = _served(lab), lab.counter("features", counter)
+    answers = _give(lab, request)
+    says = "; ".join(
+        f"{type(one).__name__} {one.code.name}: {one.problem}"
+        for one in answers
+        if isinstance(one, PalpateError)
+    )
+    refused = bool(says) and not any(isinstance(one, ModelInventory) for one in answers)
+    lab.wait(lambda: lab.counter("features", counter) > count, f"{counter} counts")
+    return Outcome(refused and _served(lab) == before, says, f"counter features.{counter}")
+
+
+def replayed_command(lab: Lab) -> Outcome:
+    """The bytes of an operator's load command are sent again, by an operator's certificate."""
+    request = signed(_command(lab), lab.token)
+    if not isinstance(_give(lab, request)[0], ModelInventory):
+        raise AssertionError("the operator's own command is not obeyed")
+    ModelAdmin(lab.operator, lab.token).roll_back("features")
+    return _refused_command(lab, request)
+
+
+def replayed_by_robot(lab: Lab) -> Outcome:
+    """The bytes of an operator's load command are sent again by a robot."""
+    request = signed(_command(lab), lab.token)
+    _give(lab, request)
+    ModelAdmin(lab.operator, lab.token).roll_back("features")
+    before = _served(lab)
+    answers = _give(lab, request, by="robot")
+    return Outcome(not answers and _served(lab) == before, "no answer", "")
+
+
+def old_command(lab: Lab) -> Outcome:
+    """A command that was signed 31 s ago, and held back."""
+    return _refused_command(
+        lab, signed(_command(lab, wall_ns=time.time_ns() - 31_000_000_000), lab.token)
+    )
+
+
+def altered_command(lab: Lab) -> Outcome:
+    """A command whose bundle was changed after it was signed."""
+    request = signed(_command(lab), lab.token)
+    return _refused_command(
+        lab, ModelRequest(request.command.replace(b"features-twin", b"features-evil"), request.mac)
+    )
+
+
+def operator_without_token(lab: Lab) -> Outcome:
+    """An operator's certificate with a token of another station."""
+    return _refused_command(lab, signed(_command(lab), b"\x01" * 32))
+
+
+def bundle_by_path(lab: Lab) -> Outcome:
+    """A command loads a bundle from a folder outside the repository."""
+    made = copy_of_bundle(_fresh(lab, "outside"), "outside")
+    return _refused_command(
+        lab, signed(_command(lab, bundle=f"../../{made}"), lab.token), "commands_refused"
+    )
+
+
+# --- bundles and records -------------------------------------------------------------------------
+
+
+def unsigned_bundle(lab: Lab) -> Outcome:
+    """A bundle without a signature is put into the repository's folder, and loaded."""
+    where = lab.folder / "models" / "unsigned" / "1"
+    if not where.exists():
+        copy_of_bundle(where, "unsigned")
+    return _logged_refusal(lab, "unsigned", "is not signed")
+
+
+def altered_bundle(lab: Lab) -> Outcome:
+    """The threshold of a signed bundle is changed in the repository, and it is loaded."""
+    where = lab.folder / "models" / "altered" / "1"
+    if not where.exists():
+        copy_of_bundle(where, "altered")
+        sign_bundle(read_bundle(where), lab.key)
+        manifest = where / "manifest.json"
+        manifest.write_text(manifest.read_text().replace('"opset"', ' "opset"'))
+    return _logged_refusal(lab, "altered", "altered after it was signed")
+
+
+def _logged_refusal(lab: Lab, bundle: str, words: str) -> Outcome:
+    since = len(lab.log("features"))
+    outcome = _refused_command(
+        lab, signed(_command(lab, bundle=bundle), lab.token), "commands_refused"
+    )
+    line = lab.logged("features", words, since)
+    return Outcome(outcome.refused, outcome.says, line)
+
+
+def hostile_model_folders(lab: Lab) -> Outcome:
+    """Every bad bundle of ``tests/hostile`` that shows before it runs is imported."""
+    from tests.hostile.test_bundles import RUN
+
+    repository = Repository(_fresh(lab, "imported"))
+    refused, names = 0, [name for name in bundles.CASES if name not in RUN]
+    for number, name in enumerate(names):
+        folder = _fresh(lab, f"bad-{number}")
+        bundles.CASES[name](folder)
+        with suppress(PalpateError):
+            repository.add(folder, read_bundle)
+            continue
+        refused += 1
+    empty = not repository.folder or not list(repository.folder.rglob("*.onnx"))
+    says = (
+        f"{refused} of {len(names)} refused by a typed error; the repository stays empty: {empty}"
+    )
+    numbers = {"cases": len(names), "refused": refused}
+    return Outcome(refused == len(names) and empty, says, "the error of the command", numbers)
+
+
+def crafted_recordings(lab: Lab) -> Outcome:
+    """Every bad record of ``tests/hostile`` is opened."""
+    refused = 0
+    for number, (_, make) in enumerate(records.CASES.items()):
+        path = _fresh(lab, f"record-{number}")
+        path.mkdir()
+        make(path / "bad.mcap")
+        with suppress(PalpateError):
+            summarise(path / "bad.mcap")
+            check_readable(path / "bad.mcap")
+            continue
+        refused += 1
+    says = f"{refused} of {len(records.CASES)} refused by a typed error"
+    numbers = {"cases": len(records.CASES), "refused": refused}
+    return Outcome(refused == len(records.CASES), says, "the error of the command", numbers)
+
+
+_ESCAPES = ("../evil", "/etc/evil", "a/../../evil", "..", "%2e%2e", "a\x00b", "*", "@service", "$*")
+
+
+def path_traversal(lab: Lab) -> Outcome:
+    """Names with ``..``, slashes and wildcards, wherever a name becomes a path or a key."""
+    before = sorted(str(path) for path in lab.folder.parent.rglob("*evil*"))
+    tries: list[Callable[[str], object]] = [
+        lambda name: issue(lab.certificates, Role.ROBOT, name),
+        lambda name: lab.operator.query(
+            endpoints.TARE, endpoints.TARE.request.decode(b""), sensor=name, timeout_s=1.0
+        ),
+        lambda name: Repository.of_config(ModelsConfig(folder=lab.folder / "models")).resolve(
+            f"mine:{name}"
+        ),
+        lambda name: sensor_key(name, "finger", "electrodes"),
+        lambda name: service_key("lab", name, "a", "status"),
+    ]
+    refused = total = 0
+    for one in tries:
+        for name in _ESCAPES:
+            if name == "*" and one in tries[3:]:
+                continue  # stands for any name there
+            total += 1
+            refused += bool(_error(lambda one=one, name=name: one(name)))
+    after = sorted(str(path) for path in lab.folder.parent.rglob("*evil*"))
+    says = f"{refused} of {total} refused by a typed error"
+    numbers = {"cases": total, "refused": refused}
+    return Outcome(refused == total and before == after, says, "the caller's error", numbers)
+
+
+def _fresh(lab: Lab, name: str) -> Path:
+    """A path of the lab at which nothing is."""
+    path = lab.folder / "attacks" / name
+    shutil.rmtree(path, ignore_errors=True)
+    path.parent.mkdir(exist_ok=True)
+    return path
+
+
+# --- sizes and floods ----------------------------------------------------------------------------
+
+
+def oversize(lab: Lab) -> Outcome:
+    """A robot sends poses of 100 kB and of 5 MiB, 20 of each."""
+    key = sensor_key(STATION, "arm", "robot_pose")
+    pid = lab.processes()["gateway"]
+    before, bytes_before = lab.counter("features", "estimates_published"), resident_bytes(pid)
+    with Heard(lab.operator, key) as heard:
+        for _ in range(20):
+            for size in (100_000, 5 << 20):
+                raw(lab.robot).put(key, b"\x00" * size)
+        time.sleep(2 * QUIET_S)
+        largest = max(map(len, heard.payloads), default=0)
+    grown = (resident_bytes(pid) - bytes_before) / 1e6
+    says = f"nothing; the largest that arrived has {largest} bytes"
+    fine = not largest and grown < 100 and _goes_on(lab, before)
+    return Outcome(fine, says, "", {"gateway_grew_mb": round(grown, 1)})
+
+
+def flood_of_messages(lab: Lab) -> Outcome:
+    """A robot publishes poses that are none, as fast as it can."""
+    key, pid = sensor_key(STATION, "arm", "robot_pose"), lab.processes()["gateway"]
+    before, bytes_before = lab.counter("features", "estimates_published"), resident_bytes(pid)
+    sent, end_s = 0, time.monotonic() + FLOOD_S
+    publisher = raw(lab.robot).declare_publisher(key)
+    while time.monotonic() < end_s:
+        publisher.put(b"\xff" * 200)
+        sent += 1
+    publisher.undeclare()
+    during = lab.counter("features", "estimates_published") - before
+    grown = (resident_bytes(pid) - bytes_before) / 1e6
+    numbers = {
+        "sent_per_s": round(sent / FLOOD_S),
+        "estimates_per_s": round(during / FLOOD_S, 1),
+        "gateway_grew_mb": round(grown, 1),
+    }
+    fine = grown < 300 and _goes_on(lab, before + during)
+    return Outcome(fine, "nothing", _pose_counter(lab), numbers)
+
+
+def _pose_counter(lab: Lab) -> str:
+    status = lab.status("gateway")
+    counters = {} if status is None else dict(status.counters)
+    named = [f"{name} {n:,}" for name, n in sorted(counters.items()) if "reject" in name and n]
+    return f"counter gateway.{', '.join(named)}" if named else ""
+
+
+def flood_of_questions(lab: Lab) -> Outcome:
+    """A robot asks the features service for 3,000 estimates of nonsense at once."""
+    key = service_key(STATION, "features", "features", "estimate")
+    before = lab.counter("features", "estimates_published")
+    asked = 3000
+    answers: list[zenoh.Reply] = []
+    began_s = time.monotonic()
+    for _ in range(asked):
+        raw(lab.robot).get(
+            key,
+            answers.append,
+            payload=b"\xff" * 100,
+            encoding="application/protobuf;palpate.v1.FeatureRequest",
+            timeout=LIVE_S,
+        )
+    with suppress(TimeoutError):
+        lab.wait(lambda: len(answers) >= asked, "each is answered")
+    seconds = time.monotonic() - began_s
+    codes = Counter(
+        ERROR.decode(reply.err.payload.to_bytes()).code.name
+        for reply in answers
+        if reply.err is not None
+    )
+    numbers = {
+        "asked": float(asked),
+        "seconds": round(seconds, 1),
+        "estimates_per_s": round(
+            (lab.counter("features", "estimates_published") - before) / seconds, 1
+        ),
+    }
+    fine = codes.total() == asked and _goes_on(lab, before)
+    says = ", ".join(f"{count} {code}" for code, count in codes.most_common())
+    return Outcome(fine, says, "counters of features", numbers)
+
+
+def _goes_on(lab: Lab, before: int) -> bool:
+    """Whether estimates still come, from the same processes."""
+    with suppress(TimeoutError):
+        now = lab.counter("features", "estimates_published")
+        lab.wait(lambda: lab.counter("features", "estimates_published") > now + 20, "estimates")
+        return now >= before
+    return False
+
+
+ATTACKS: dict[str, Callable[[Lab], Outcome]] = {
+    "no certificate": no_certificate,
+    "certificate of another authority": foreign_authority,
+    "certificate that has ended": expired,
+    "certificate without a role": no_role,
+    "no encryption": no_encryption,
+    "open doors": only_loopback,
+    "200 half-open connections": half_open_links,
+    "robot sends frames and estimates": _forging("robot", "electrodes", "features", "tare"),
+    "gateway sends estimates": _forging("gateway", "features", "field"),
+    "service sends frames": _forging("service", "electrodes", "tare"),
+    "operator sends frames": _forging("operator", "electrodes", "robot_pose"),
+    "robot tares": robot_tares,
+    "robot loads a model": robot_loads,
+    "robot claims a finger": robot_claims,
+    "robot answers for a service": robot_answers,
+    "replayed command": replayed_command,
+    "command replayed by a robot": replayed_by_robot,
+    "command held back": old_command,
+    "altered command": altered_command,
+    "operator without the token": operator_without_token,
+    "bundle by path": bundle_by_path,
+    "unsigned bundle": unsigned_bundle,
+    "altered bundle": altered_bundle,
+    "hostile model folders": hostile_model_folders,
+    "crafted recordings": crafted_recordings,
+    "path traversal": path_traversal,
+    "oversize messages": oversize,
+    "flood of messages": flood_of_messages,
+    "flood of questions": flood_of_questions,
+}
+
+SILENT = frozenset(
+    {
+        "robot sends frames and estimates",
+        "gateway sends estimates",
+        "service sends frames",
+        "operator sends frames",
+        "robot tares",
+        "robot loads a model",
+        "robot claims a finger",
+        "robot answers for a service",
+        "command replayed by a robot",
+        "oversize messages",
+    }
+)
+"""Attacks that the station refuses and does not log: Zenoh 1.10 tells of none of these."""
