@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel release clean
+.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel release clean sbom audit
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -117,6 +117,16 @@ proto: $(VENV)/.dev  ## regenerate the Python of the .proto files and their page
 
 bundle: $(VENV)/.dev  ## train the shipped bundle again, on the virtual finger | 1-5 min
 	$(BIN)/palpate bundle virtual
+
+sbom: $(VENV)/.dev  ## every package of .venv with version and licence, as CycloneDX: dist/palpate.cdx.json | 10 s
+	@mkdir -p dist
+	$(BIN)/cyclonedx-py environment $(BIN)/python --pyproject pyproject.toml --mc-type application \
+	    --output-reproducible --of JSON --output-file dist/palpate.cdx.json
+
+# --strict: a package that could not be looked up is a failure, not a pass.
+audit: $(VENV)/.dev  ## known vulnerabilities of these packages; asks pypi.org, which must be reachable | 1-2 min
+	@$(pip_install) -e '.[audit]' | $(show)
+	$(BIN)/pip-audit --strict --skip-editable --progress-spinner off --path $(wildcard $(VENV)/lib/python3*/site-packages)
 
 build: $(VENV)/.dev  ## wheel and source archive, into dist/; the same bytes from the same tree | 10 s
 	rm -rf dist

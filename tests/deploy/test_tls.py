@@ -16,7 +16,7 @@ pytest.importorskip("cryptography")
 
 from palpate import Client
 from palpate.bus import Session, run_router
-from palpate.config import LinkConfig, Role
+from palpate.config import LinkConfig, Role, endpoint_host_port, is_loopback
 from palpate.errors import ConfigError, LinkError
 from palpate.health import Health, HealthReporter
 from palpate_deploy.cli.app import app
@@ -122,3 +122,16 @@ def test_variables_of_who_joins_do_not_disturb_a_profile() -> None:
     result = CliRunner().invoke(app, ["up", "--print-config"], env=variables)
     assert result.exit_code == 0, result.output
     assert "tcp/127.0.0.1:7447" in result.stdout
+
+
+def test_whatever_listens_does_so_on_loopback_by_default() -> None:
+    listening = 0
+    for name, command in _commands(typer.main.get_command(app), "palpate"):
+        for option in command.params:
+            if "--listen" not in option.opts or not option.default:
+                continue
+            listening += 1
+            default = str(option.default)
+            address = default if "/" not in default else endpoint_host_port(default)[0]
+            assert is_loopback(address), f"{name} --listen {default}"
+    assert listening >= 5

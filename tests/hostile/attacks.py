@@ -255,7 +255,8 @@ def robot_tares(lab: Lab) -> Outcome:
     with Heard(lab.operator, key) as tares:
         says = _error(lambda: ask_tare(lab.robot, "finger", frames=5, timeout_s=3.0))
         time.sleep(QUIET_S)
-        return Outcome(bool(says) and not tares.payloads, says, "")
+        # A gateway that was asked refuses, too, if the finger is touched: by a RemoteError.
+        return Outcome(says.startswith("LinkError") and not tares.payloads, says, "")
 
 
 def robot_loads(lab: Lab) -> Outcome:
@@ -269,14 +270,16 @@ def robot_loads(lab: Lab) -> Outcome:
 def robot_claims(lab: Lab) -> Outcome:
     """A robot shows an older claim on a finger, to make its gateway give it up."""
     claim = SensorClaim(STATION, "finger", 1, True, 1, "gateway", "thief", "X")
-    before = lab.counter("features", "estimates_published")
+    before, since = lab.counter("features", "estimates_published"), len(lab.log("gateway"))
     token = raw(lab.robot).liveliness().declare_token(claim_key(claim))
     try:
         time.sleep(3 * QUIET_S)
         after = lab.counter("features", "estimates_published")
     finally:
         token.undeclare()
-    return Outcome(after > before + 20, "nothing", "", {"estimates_meanwhile": after - before})
+    given_up = "already published" in lab.log("gateway")[since:]
+    fine = not given_up and after > before
+    return Outcome(fine, "nothing", "", {"estimates_meanwhile": after - before})
 
 
 def robot_answers(lab: Lab) -> Outcome:
@@ -287,7 +290,7 @@ def robot_answers(lab: Lab) -> Outcome:
         time.sleep(QUIET_S)
         found = [
             reply.ok.payload.to_bytes()
-            for reply in raw(lab.operator).get(key, timeout=5.0)
+            for reply in raw(lab.operator).get(key, timeout=5.0, target=zenoh.QueryTarget.ALL)
             if reply.ok is not None
         ]
     finally:
