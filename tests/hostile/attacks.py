@@ -27,6 +27,7 @@ from tests.hostile.lab import LIVE_S, STATION, Heard, Lab, copy_of_bundle, raw, 
 
 from palpate.admin import new_nonce, signed
 from palpate.bus import endpoints
+from palpate.bus.link import open_zenoh
 from palpate.bus.topics import SensorClaim, claim_key, sensor_key, service_key
 from palpate.client.estimates import ask_tare
 from palpate.client.models import ModelAdmin
@@ -39,6 +40,7 @@ from palpate.files.signature import sign_bundle
 from palpate.messages import ModelAction, ModelCommand, ModelInventory, ModelRequest
 from palpate_deploy.station import certificates
 from palpate_deploy.station.certificates import issue, make_authority
+from palpate_deploy.station.host import free_endpoint
 from palpate_services.config import ModelsConfig
 from palpate_services.inference.repository import Repository
 
@@ -245,7 +247,7 @@ def _forging(holder: str, *streams: str) -> Callable[[Lab], Outcome]:
             reached = sum(one.payloads.count(_FORGED) for one in heard)
         return Outcome(not reached, "nothing", "", {"sent": 20 * len(keys), "heard": reached})
 
-    attack.__doc__ = f"A {holder} publishes {', '.join(streams)}."
+    attack.__doc__ = f"Whoever has the certificate of a {holder} publishes {', '.join(streams)}."
     return attack
 
 
@@ -296,6 +298,22 @@ def robot_answers(lab: Lab) -> Outcome:
     finally:
         answer.undeclare()
     return Outcome(_FORGED not in found, "nothing", "", {"answers": len(found)})
+
+
+def robot_routes(lab: Lab) -> Outcome:
+    """A robot plays the router for a service that was sent there, and forges frames."""
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    with ExitStack() as stack:
+        router = open_zenoh(lab.link("robot", connect=(), listen=(endpoint,)), "router")
+        stack.callback(router.close)
+        victim = stack.enter_context(lab.join("service", honest=True, connect=(endpoint,)))
+        frames = stack.enter_context(Heard(victim, _FRAMES))
+        time.sleep(QUIET_S)
+        for _ in range(10):
+            router.put(_FRAMES, _FORGED)
+        time.sleep(QUIET_S)
+        numbers = {"sent": 10.0, "heard": float(len(frames.payloads))}
+        return Outcome(victim.has_router() and not frames.payloads, "nothing", "", numbers)
 
 
 def _served(lab: Lab) -> list[str]:
@@ -401,7 +419,7 @@ def unsigned_bundle(lab: Lab) -> Outcome:
 
 
 def altered_bundle(lab: Lab) -> Outcome:
-    """The threshold of a signed bundle is changed in the repository, and it is loaded."""
+    """A byte of a signed bundle's manifest is changed in the repository, and it is loaded."""
     where = lab.folder / "models" / "altered" / "1"
     if not where.exists():
         copy_of_bundle(where, "altered")
@@ -463,7 +481,7 @@ _ESCAPES = ("../evil", "/etc/evil", "a/../../evil", "..", "%2e%2e", "a\x00b", "*
 
 def path_traversal(lab: Lab) -> Outcome:
     """Names with ``..``, slashes and wildcards, wherever a name becomes a path or a key."""
-    before = sorted(str(path) for path in lab.folder.parent.rglob("*evil*"))
+    before = _evil(lab)
     tries: list[Callable[[str], object]] = [
         lambda name: issue(lab.certificates, Role.ROBOT, name),
         lambda name: lab.operator.query(
@@ -482,10 +500,16 @@ def path_traversal(lab: Lab) -> Outcome:
                 continue  # stands for any name there
             total += 1
             refused += bool(_error(lambda one=one, name=name: one(name)))
-    after = sorted(str(path) for path in lab.folder.parent.rglob("*evil*"))
+    after = _evil(lab)
     says = f"{refused} of {total} refused by a typed error"
     numbers = {"cases": total, "refused": refused}
     return Outcome(refused == total and before == after, says, "the caller's error", numbers)
+
+
+def _evil(lab: Lab) -> list[str]:
+    """What an escape would have made, in the lab's folder or beside it."""
+    found = [*lab.folder.rglob("*evil*"), *lab.folder.parent.glob("*evil*")]
+    return sorted(map(str, found))
 
 
 def _fresh(lab: Lab, name: str) -> Path:
@@ -533,7 +557,9 @@ def flood_of_messages(lab: Lab) -> Outcome:
         "estimates_per_s": round(during / FLOOD_S, 1),
         "gateway_grew_mb": round(grown, 1),
     }
+    ended_s = time.monotonic()
     fine = grown < 300 and _goes_on(lab, before + during)
+    numbers["next_20_estimates_after_s"] = round(time.monotonic() - ended_s, 1)
     return Outcome(fine, "nothing", _pose_counter(lab), numbers)
 
 
@@ -604,6 +630,7 @@ ATTACKS: dict[str, Callable[[Lab], Outcome]] = {
     "robot loads a model": robot_loads,
     "robot claims a finger": robot_claims,
     "robot answers for a service": robot_answers,
+    "robot plays the router": robot_routes,
     "replayed command": replayed_command,
     "command replayed by a robot": replayed_by_robot,
     "command held back": old_command,
@@ -630,6 +657,7 @@ SILENT = frozenset(
         "robot loads a model",
         "robot claims a finger",
         "robot answers for a service",
+        "robot plays the router",
         "command replayed by a robot",
         "oversize messages",
     }

@@ -94,22 +94,25 @@ class Lab(Closing):
         )
         self._sessions = contextlib.ExitStack()
         try:
-            self.operator = self._sessions.enter_context(self.join("operator"))
+            self.operator = self._sessions.enter_context(self.join("operator", honest=True))
             self.robot = self._sessions.enter_context(self.join("robot", connect=(self.outside,)))
             self.wait(self._serves, "the station serves")
         except BaseException:
             self.close()
             raise
 
-    def link(self, holder: str, **changes: Any) -> LinkConfig:
-        """The link of whoever holds the certificate in a folder of the lab."""
-        tls = TlsConfig.of_folder(self.certificates / holder)
+    def link(self, holder: str, *, honest: bool = False, **changes: Any) -> LinkConfig:
+        """The link of whoever holds the certificate in a folder of the lab.
+
+        Who is not ``honest`` does not keep to the roles: its own Zenoh refuses nothing.
+        """
+        tls = TlsConfig.of_folder(self.certificates / holder).model_copy(update={"roles": honest})
         values = {"connect": (self.endpoint,), "tls": tls, "wait_for_router_s": LIVE_S}
         return LinkConfig(**(values | changes))
 
-    def join(self, holder: str, **changes: Any) -> Session:
-        """A session of that holder."""
-        return Session.open(self.link(holder, **changes), station=STATION)
+    def join(self, holder: str, *, honest: bool = False, **changes: Any) -> Session:
+        """A session of that holder; see ``link``."""
+        return Session.open(self.link(holder, honest=honest, **changes), station=STATION)
 
     def _serves(self) -> bool:
         features = self.status("features")

@@ -116,6 +116,8 @@ def zenoh_config(link: LinkConfig, mode: str) -> zenoh.Config:
             "close_link_on_expiration": True,
         }
         if link.tls.roles:
+            # Somebody with a certificate may announce a listener without: nobody connects there.
+            settings["transport"]["link"]["protocols"] = ["tls", access.DOOR_PROTOCOL]
             settings |= access.settings()
     return zenoh.Config.from_json5(json.dumps(settings))
 
