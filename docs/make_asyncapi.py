@@ -1,4 +1,4 @@
-"""Write docs/asyncapi.json and docs/asyncapi.md from the topic and endpoint tables (``make docs``).
+"""Write docs/asyncapi.json and docs/asyncapi.md from the tables of ``palpate.bus`` (``make docs``).
 
 ``python docs/make_asyncapi.py``          writes both
 ``python docs/make_asyncapi.py --check``  exits 1 if a committed file is not what it would write
@@ -12,10 +12,11 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
+from palpate.bus.access import PUBLISHERS, QUESTIONS
 from palpate.bus.attachments import attachment_of
 from palpate.bus.endpoints import ENDPOINTS, Endpoint
 from palpate.bus.topics import (
@@ -31,14 +32,14 @@ from palpate.bus.topics import (
     Topic,
 )
 from palpate.codec import ERROR, STAGE_TIMINGS, Codec
-from palpate.config import DEFAULT_ROUTER
+from palpate.config import DEFAULT_ROUTER, Role
 
 FOLDER = Path(__file__).resolve().parent
 PROTOS = FOLDER.parent / "protos" / "palpate" / f"v{CONTRACT_VERSION}"
 DOCUMENT, PAGE = FOLDER / "asyncapi.json", FOLDER / "asyncapi.md"
 
 HEAD = """\
-<!-- Written by docs/make_asyncapi.py from palpate/bus/topics.py and endpoints.py; do not edit. -->
+<!-- Written by docs/make_asyncapi.py from topics, endpoints and access of palpate/bus; do not edit. -->
 # Streams and questions of a station
 
 Everything that a station speaks over Zenoh, for programs in any language;
@@ -48,6 +49,9 @@ Everything that a station speaks over Zenoh, for programs in any language;
 A payload is protobuf, and its Zenoh encoding names the message:
 `application/protobuf;palpate.v1.<Message>`. Payloads are at most {limit:,} bytes. `<station>`,
 `<sensor>`, `<service>` and `<instance>` are 1-63 of `a-z`, `0-9`, `-`, `_`.
+
+Who publishes, asks and answers is enforced where a station has certificates
+([security.md](security.md)); everybody with a role may subscribe.
 """
 
 NAME = {"pattern": "^[a-z0-9][a-z0-9_-]{0,62}$"}
@@ -142,12 +146,18 @@ def stream_quality(topic: Topic[Any]) -> dict[str, Any]:
         "usualRateHz": topic.rate_hz,
         "recorded": topic.recorded,
         "sequenceWithoutHoles": topic.contiguous,
+        "publishers": in_order(PUBLISHERS[topic.name]),
         **timings,
     }
 
 
-def question_quality(endpoint: Endpoint[Any, Any]) -> dict[str, Any]:
-    """How a question is asked."""
+def in_order(roles: Collection[Role]) -> list[str]:
+    """Roles by their names, always in one order."""
+    return [role.value for role in Role if role in roles]
+
+
+def question_quality(constant: str, endpoint: Endpoint[Any, Any]) -> dict[str, Any]:
+    """How a question is asked, and by whom."""
     return {
         "kind": "query",
         "encoding": ENCODING_PREFIX + endpoint.request.schema,
@@ -156,6 +166,8 @@ def question_quality(endpoint: Endpoint[Any, Any]) -> dict[str, Any]:
         "attachment": attachment_of(1.5).decode(),
         "consolidation": "NONE",
         "wildcards": endpoint.per_service,
+        "askers": in_order(QUESTIONS[constant].askers),
+        "answerers": in_order(QUESTIONS[constant].answerers),
     }
 
 
@@ -183,7 +195,7 @@ def document() -> dict[str, Any]:
         name = f"ask_{constant}"
         kinds = {one.schema: one for one in (endpoint.request, endpoint.reply, ERROR)}
         used |= kinds
-        channels[name] = channel_of(endpoint, kinds.values(), question_quality(endpoint))
+        channels[name] = channel_of(endpoint, kinds.values(), question_quality(constant, endpoint))
         operations[name] = {
             "action": "receive",
             "channel": {"$ref": f"#/channels/{name}"},
@@ -253,15 +265,15 @@ def page() -> str:
         "a station receives. Each estimate has its",
         f"{link(STAGE_TIMINGS)} in the attachment, not in the payload.",
         "",
-        "| key | message | usual rate | priority | recorded | meaning |",
-        "|---|---|---|---|---|---|",
+        "| key | message | usual rate | priority | recorded | published by | meaning |",
+        "|---|---|---|---|---|---|---|",
     ]
     for topic in TOPICS.values():
         rate = f"{topic.rate_hz:g} Hz" if topic.rate_hz else "on events"
         recorded = "yes" if topic.recorded else "no"
         lines.append(
             f"| {key(topic)} | {link(topic.codec)} | {rate} | {topic.priority.name} | {recorded} "
-            f"| {topic.doc} |"
+            f"| {', '.join(in_order(PUBLISHERS[topic.name]))} | {topic.doc} |"
         )
     lines += [
         "",
@@ -274,12 +286,14 @@ def page() -> str:
         "nobody serves the key, or that the reply was larger than a message may be. A question",
         "about a sensor names one sensor; one to processes may have wildcards.",
         "",
-        "| key | request | reply | meaning |",
-        "|---|---|---|---|",
+        "| key | request | reply | asked by | answered by | meaning |",
+        "|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| {key(one)} | {link(one.request)} | {link(one.reply)} | {one.doc} |"
-        for one in ENDPOINTS.values()
+        f"| {key(one)} | {link(one.request)} | {link(one.reply)} "
+        f"| {', '.join(in_order(QUESTIONS[constant].askers))} "
+        f"| {', '.join(in_order(QUESTIONS[constant].answerers))} | {one.doc} |"
+        for constant, one in ENDPOINTS.items()
     ]
     lines += [
         "",

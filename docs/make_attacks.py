@@ -57,9 +57,15 @@ _SIZE, _RATE_HZ, _COUNT, _ROUNDS = 300, 200, 600, 3
 _KEY = "palpate/@v1/lab/finger/electrodes"
 
 
-def _attack() -> dict[str, Outcome]:
+FLOOD = "flood of messages"
+_FLOODS = 5
+
+
+def _attack() -> tuple[dict[str, Outcome], list[Outcome]]:
+    """What came of each attack, and of the one that is not stopped several times."""
     with tempfile.TemporaryDirectory(prefix="attacks-") as folder, Lab(Path(folder)) as lab:
-        return {name: attack(lab) for name, attack in ATTACKS.items()}
+        outcomes = {name: attack(lab) for name, attack in ATTACKS.items()}
+        return outcomes, [ATTACKS[FLOOD](lab) for _ in range(_FLOODS)]
 
 
 def _round(gateway: Session, service: Session) -> tuple[float, float]:
@@ -155,11 +161,19 @@ def _row(name: str, outcome: Outcome) -> str:
 
 def main() -> None:
     """Attack, measure, write; the exit status is 1 if an attack had an effect."""
-    outcomes, cost = _attack(), _cost()
+    (outcomes, floods), cost = _attack(), _cost()
     meant = {name: (attack.__doc__ or "").splitlines()[0] for name, attack in ATTACKS.items()}
     lines = [HEAD + "\n".join(_row(name, one) for name, one in outcomes.items()), ""]
     lines += ["What each is:", ""]
     lines += [f"* **{name}**: {text}" for name, text in meant.items()]
+    rates = sorted(one.numbers["estimates_per_s"] for one in floods)
+    waits = sorted(one.numbers["next_20_estimates_after_s"] for one in floods)
+    lines += [
+        "",
+        f"{_FLOODS} more floods of messages by a robot on the station's own host left "
+        f"{rates[0]:g} to {rates[-1]:g} of 100 estimates a second; the next 20 came "
+        f"{waits[0]:g} to {waits[-1]:g} s after the end.",
+    ]
     lines.append(COST.format(size=_SIZE, rate=_RATE_HZ, count=_COUNT, rounds=_ROUNDS).rstrip())
     lines += [
         f"| {name} | {one['median_us']} µs | {one['p99_us']} µs |" for name, one in cost.items()
@@ -175,6 +189,7 @@ def main() -> None:
             }
             for name, one in outcomes.items()
         },
+        "floods": [one.numbers for one in floods],
         "cost": cost,
         "all_refused": all(one.refused for one in outcomes.values()),
         "machine": machine(),

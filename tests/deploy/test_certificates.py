@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import re
 import shutil
 import ssl
 import stat
@@ -24,6 +25,7 @@ from palpate.errors import ConfigError
 from palpate_deploy.cli.app import app
 from palpate_deploy.station import certificates
 from palpate_deploy.station.certificates import issue, make_authority, read_certificate
+from palpate_deploy.station.profile import load_profile
 
 
 def _run(*words: object, code: int = 0) -> str:
@@ -208,3 +210,15 @@ def test_a_link_ends_with_the_certificate_that_opened_it(
     finally:
         stop.set()
         router.join(60)
+
+
+def test_the_profiles_on_the_page_are_right(lab: Path, tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "security.md").read_text()
+    blocks = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    assert len(blocks) == 2
+    path = tmp_path / "lab.toml"
+    path.write_text("".join(blocks))
+    profile = load_profile(path)
+    assert profile.link.connect == ("tls/127.0.0.1:7447",)
+    assert profile.link.listen == ("tls/127.0.0.1:0",)
+    assert profile.models.trusted_keys

@@ -436,7 +436,7 @@ def profile_text(wanted: StationWanted, probed: Sequence[ProbedDevice]) -> str:
         f'station = "{wanted.name}"\n'
         'processes = ["router", "gateway", "features", "recorder"]\n',
         "[router]\n"
-        "# Robots and commands join here. For other hosts: tls/ADDRESS:PORT, and [link.tls].\n"
+        "# Robots and commands join here. For other hosts: docs/security.md.\n"
         f"listen = {toml_value([wanted.listen])}\n",
     ]
     for one in probed:
