@@ -39,7 +39,7 @@ PROTOS = FOLDER.parent / "protos" / "palpate" / f"v{CONTRACT_VERSION}"
 DOCUMENT, PAGE = FOLDER / "asyncapi.json", FOLDER / "asyncapi.md"
 
 HEAD = """\
-<!-- Written by docs/make_asyncapi.py from topics, endpoints and access of palpate/bus; do not edit. -->
+<!-- Written by docs/make_asyncapi.py from the tables of palpate/bus; do not edit. -->
 # Streams and questions of a station
 
 Everything that a station speaks over Zenoh, for programs in any language;

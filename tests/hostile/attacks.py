@@ -12,9 +12,10 @@ import socket
 import ssl
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -64,7 +65,7 @@ class Outcome:
     refused: bool
     says: str
     logged: str
-    numbers: dict[str, float] = field(default_factory=dict)
+    numbers: Mapping[str, float] = field(default_factory=dict)
 
 
 # --- links ---------------------------------------------------------------------------------------
@@ -340,7 +341,9 @@ def _command(
     return ModelCommand(ModelAction.LOAD, STATION, "features", new_nonce(), now, bundle=bundle)
 
 
-def _give(lab: Lab, request: ModelRequest, *, by: str = "operator") -> list[object]:
+def _give(
+    lab: Lab, request: ModelRequest, *, by: str = "operator"
+) -> Sequence[ModelInventory | PalpateError]:
     session = lab.operator if by == "operator" else lab.robot
     return session.query_all(
         endpoints.MODELS, request, service="features", instance="features", timeout_s=LIVE_S
@@ -499,7 +502,7 @@ def path_traversal(lab: Lab) -> Outcome:
             if name == "*" and one in tries[3:]:
                 continue  # stands for any name there
             total += 1
-            refused += bool(_error(lambda one=one, name=name: one(name)))
+            refused += bool(_error(partial(one, name)))
     after = _evil(lab)
     says = f"{refused} of {total} refused by a typed error"
     numbers = {"cases": total, "refused": refused}

@@ -107,7 +107,11 @@ class Lab(Closing):
         Who is not ``honest`` does not keep to the roles: its own Zenoh refuses nothing.
         """
         tls = TlsConfig.of_folder(self.certificates / holder).model_copy(update={"roles": honest})
-        values = {"connect": (self.endpoint,), "tls": tls, "wait_for_router_s": LIVE_S}
+        values: dict[str, Any] = {
+            "connect": (self.endpoint,),
+            "tls": tls,
+            "wait_for_router_s": LIVE_S,
+        }
         return LinkConfig(**(values | changes))
 
     def join(self, holder: str, *, honest: bool = False, **changes: Any) -> Session:

@@ -22,9 +22,9 @@ from palpate.files.bundle import read_bundle
 from palpate_deploy.station.logs import cell
 from palpate_services.config import FeaturesServiceConfig
 from palpate_services.inference import trial as trial_module
-from palpate_services.inference.repository import PACKAGED, resolve
+from palpate_services.inference.repository import PACKAGED, resolve, ships
 from palpate_services.inference.services import run_estimating
-from palpate_services.inference.trial import proven, ships
+from palpate_services.inference.trial import proven
 
 # These have to be run before they show what they are.
 RUN = (
