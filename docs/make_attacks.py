@@ -16,7 +16,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from tests.hostile.attacks import ATTACKS, Outcome
+from tests.hostile.attack_bus import Outcome
+from tests.hostile.attacks import ATTACKS
 from tests.hostile.lab import LIVE_S, Lab
 
 from palpate.bus import Session, run_router

@@ -175,6 +175,23 @@ class Lab(Closing):
                 raise TimeoutError(f"not within {LIVE_S:g} s: {what}")
             time.sleep(0.1)
 
+    def goes_on(self, before: int) -> bool:
+        """Whether estimates still come, and none was lost of ``before`` by a restart."""
+        now = self.counter("features", "estimates_published")
+        with contextlib.suppress(TimeoutError):
+            self.wait(
+                lambda: self.counter("features", "estimates_published") > now + 20, "estimates"
+            )
+            return now >= before
+        return False
+
+    def fresh(self, name: str) -> Path:
+        """A path of the lab at which nothing is."""
+        path = self.folder / "attacks" / name
+        shutil.rmtree(path, ignore_errors=True)
+        path.parent.mkdir(exist_ok=True)
+        return path
+
     @property
     def token(self) -> bytes:
         """The station's admin token."""
