@@ -159,7 +159,15 @@ class RouterOptions(StrictConfig):
         """A link with this router, if one is named, and with other changes.
 
         ``roles`` False: those who join that router, e.g. ROS, have no roles of palpate.
+
+        Raises:
+            ConfigError: They would have to join a router that refuses whoever has no role.
         """
+        if not roles and not self.connect and link.has_roles:
+            raise ConfigError(
+                "the station's own router passes on only what the roles of palpate may send",
+                remedy="give ROS a router of its own (rmw_zenohd), and name it: connect",
+            )
         if self.connect:
             tls = self.tls
             if tls is not None and not roles:

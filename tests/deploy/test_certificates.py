@@ -96,6 +96,10 @@ def test_what_cannot_be_issued_is_refused(lab: Path, words: tuple[str, ...], say
     assert not (lab.parent / "evil").exists()
 
 
+def test_another_role_is_refused_by_name(lab: Path) -> None:
+    assert "one of: router, gateway" in _run("certs", "issue", lab, "--role", "boss", code=2)
+
+
 def test_without_an_authority_nothing_is_issued(tmp_path: Path) -> None:
     assert "holds no authority" in _run("certs", "issue", tmp_path, "--role", "robot", code=2)
     assert "holds no certificates" in _run("certs", "show", tmp_path, code=2)

@@ -16,7 +16,7 @@ from palpate.bus import Session, run_router
 from palpate.bus.access import PUBLISHERS, QUESTIONS, Deed, rights
 from palpate.bus.endpoints import ENDPOINTS
 from palpate.bus.topics import TOPICS, sensor_key, service_key
-from palpate.config import LinkConfig, Role, TlsConfig
+from palpate.config import LinkConfig, Role, RouterOptions, TlsConfig
 from palpate.errors import ConfigError
 from palpate_deploy.station.certificates import issue, make_authority
 
@@ -259,3 +259,15 @@ def test_links_with_roles_have_certificates_everywhere(authority: Path) -> None:
         Session.open(LinkConfig(certificates=authority, connect=("tls/127.0.0.1:1",)))
     with pytest.raises(ConfigError, match="palpate certs issue makes it"):
         LinkConfig(certificates=authority / "none").as_role(Role.ROBOT)
+
+
+def test_ros_needs_a_router_of_its_own(authority: Path) -> None:
+    own = LinkConfig(certificates=authority, connect=("tls/127.0.0.1:1",)).as_role(Role.SERVICE)
+    with pytest.raises(ConfigError, match="only what the roles of palpate"):
+        RouterOptions().changed(own, roles=False)
+    other = RouterOptions(
+        connect="tls/127.0.0.1:2", tls=TlsConfig.of_folder(authority / "service")
+    ).changed(own, roles=False)
+    assert other.connect == ("tls/127.0.0.1:2",)
+    assert not other.has_roles
+    assert RouterOptions().changed(own) == own

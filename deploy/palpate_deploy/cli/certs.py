@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from palpate.config import Role
 from palpate_deploy.cli.options import JsonOption, example, group
 
 if TYPE_CHECKING:
@@ -45,7 +44,9 @@ def ca(
 )
 def issue(
     folder: FolderArgument,
-    role: Annotated[Role, typer.Option(help="What the holder may do.")],
+    role: Annotated[
+        str, typer.Option(help="What the holder may do: router, gateway, service, robot, operator.")
+    ],
     name: Annotated[
         str, typer.Option(help="Name of the holder and of its folder; default: the role.")
     ] = "",
@@ -56,14 +57,18 @@ def issue(
     days: Annotated[int, typer.Option(min=1, max=36500, help="Validity [days].")] = 365,
 ) -> None:
     """Issue a certificate for one role: a folder with ca.pem, cert.pem, key.pem."""
-    from palpate.config import TlsConfig
+    from palpate.config import Role, TlsConfig
+    from palpate.errors import ConfigError
     from palpate.process import require
 
     require("cryptography", extra="security")
     from palpate_deploy.station.certificates import issue as make
     from palpate_deploy.station.certificates import read_certificate
 
-    made = read_certificate(TlsConfig.of_folder(make(folder, role, name, host or (), days=days)))
+    if role not in set(Role):
+        raise ConfigError(f"{role!r} is no role", remedy=f"one of: {', '.join(Role)}")
+    target = make(folder, Role(role), name, host or (), days=days)
+    made = read_certificate(TlsConfig.of_folder(target))
     print(f"{made.folder}: {role}, valid until {made.until:%Y-%m-%d}, for {', '.join(made.hosts)}")
 
 
