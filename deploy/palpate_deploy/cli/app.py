@@ -14,6 +14,7 @@ from palpate_deploy.cli import data as training
 from palpate_deploy.cli.bench import bench_app
 from palpate_deploy.cli.certs import certs_app
 from palpate_deploy.cli.files import bundle_app, register
+from palpate_deploy.cli.install import register_install
 from palpate_deploy.cli.models import StationProfileOption, TokenOption, model_app
 from palpate_deploy.cli.options import (
     DEFAULT_CONNECT,
@@ -394,6 +395,7 @@ app.add_typer(bundle_app, name="bundle")
 app.add_typer(certs_app, name="certs")
 app.add_typer(bench_app, name="bench")
 register(app)
+register_install(app)
 app.add_typer(fem_app, name="fem")
 app.add_typer(gateway_app, name="gateway")
 app.add_typer(emulate_app, name="emulate")
