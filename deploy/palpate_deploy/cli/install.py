@@ -19,7 +19,8 @@ def install(
     profile: Annotated[
         str,
         typer.Argument(
-            metavar="NAME|FILE", help="A profile; that of an installed station brings it up to date."
+            metavar="NAME|FILE",
+            help="A profile; that of an installed station brings it up to date.",
         ),
     ],
     name: Annotated[
@@ -96,6 +97,8 @@ def uninstall(
 def register_install(app: typer.Typer) -> None:
     """Add these commands to ``app``."""
     app.command(
-        epilog=example("palpate install lab.toml", "palpate install /etc/palpate/lab.toml --rollback")
+        epilog=example(
+            "palpate install lab.toml", "palpate install /etc/palpate/lab.toml --rollback"
+        )
     )(install)
     app.command(epilog=example("palpate uninstall lab", "palpate uninstall lab --purge"))(uninstall)

@@ -53,7 +53,11 @@ def _containers(plan: ServicePlan) -> list[_Container]:
             continue
         run = ("run", FEM) if solver else ("up",)
         own = (FEM,) if solver else plan.supervised
-        environment = {"HOME": str(STATE), "XDG_STATE_HOME": f"{STATE}/state", "MPLCONFIGDIR": "/tmp"}
+        environment = {
+            "HOME": str(STATE),
+            "XDG_STATE_HOME": f"{STATE}/state",
+            "MPLCONFIGDIR": "/tmp",
+        }
         if solver:
             environment = {"HOME": "/tmp", "XDG_CACHE_HOME": "/var/cache/palpate"}
         name = f"palpate-fem-{plan.name}" if solver else f"palpate-{plan.name}"

@@ -124,9 +124,14 @@ class Host:
         """Folders that were made to lock it; they go again if nothing is put into them."""
 
     @property
+    def is_this_host(self) -> bool:
+        """Whether it is the host itself, and not an image."""
+        return self.root == Path("/")
+
+    @property
     def is_running(self) -> bool:
-        """Whether this is the host itself, and systemd runs it (sd_booted(3))."""
-        return self.root == Path("/") and Path("/run/systemd/system").is_dir()
+        """Whether it is the host itself, and systemd runs it (sd_booted(3))."""
+        return self.is_this_host and Path("/run/systemd/system").is_dir()
 
     def at(self, path: str | PurePosixPath) -> Path:
         """Where a path of the host lies; its last part may be a link, which is not followed.
@@ -191,15 +196,20 @@ class Host:
         Raises:
             InstallError: Another one runs.
         """
-        self.made = self.make_folders(LEDGERS_FOLDER)
         folder = self.at(LEDGERS_FOLDER)
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            self.made = self.make_folders(LEDGERS_FOLDER)
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        except FileNotFoundError as error:  # another one removes the folder at this moment
+            raise self._busy() from error
         try:
             self._lock(handle, folder)
-            folder.chmod(0o700)
-            yield self
+            try:
+                folder.chmod(0o700)
+                yield self
+            finally:
+                self.remove_empty([*self.made, str(LEDGERS_FOLDER), str(PROFILES_FOLDER)])
         finally:
-            self.remove_empty([*self.made, str(LEDGERS_FOLDER), str(PROFILES_FOLDER)])
             os.close(handle)
 
     def _lock(self, handle: int, folder: Path) -> None:
@@ -210,7 +220,10 @@ class Host:
                 return
         except (BlockingIOError, FileNotFoundError):
             pass
-        raise InstallError(
+        raise self._busy()
+
+    def _busy(self) -> InstallError:
+        return InstallError(
             f"another palpate install or uninstall works on {self.root}",
             remedy="wait until it has ended",
         )
@@ -325,7 +338,7 @@ class Books:
                 if look is Found.OURS:
                     file.unlink()
                     self.host.remove_wish(file.name)
-            elif look in (Found.OURS, Found.NOTHING):
+            elif look is Found.NOTHING or (look is Found.OURS and journal.found[path] not in new):
                 _write(file, journal.found[path])
         self.host.remove_empty(set(journal.ledger.folders) - set(self.read().folders))
         self._journal.unlink()
@@ -348,11 +361,15 @@ def _stage(file: Path, text: str, *, mode: int = 0o644) -> Path:
     temporary = _staged_name(file)
     # A new file, whatever somebody has put there meanwhile.
     handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, mode)
-    with open(handle, "wb") as stream:
-        os.fchmod(handle, mode)
-        stream.write(text.encode())
-        stream.flush()
-        os.fsync(handle)
+    try:
+        with open(handle, "wb") as stream:
+            os.fchmod(handle, mode)
+            stream.write(text.encode())
+            stream.flush()
+            os.fsync(handle)
+    except BaseException:
+        temporary.unlink()
+        raise
     return temporary
 
 

@@ -75,9 +75,7 @@ def present_version() -> str:
         return "0"
 
 
-def make_plan(
-    order: InstallOrder, state: PurePosixPath, program: str
-) -> tuple[ServicePlan, str]:
+def make_plan(order: InstallOrder, state: PurePosixPath, program: str) -> tuple[ServicePlan, str]:
     """The plan of a service, and its profile's text.
 
     Args:
@@ -93,9 +91,15 @@ def make_plan(
     path = profiles.profile_path(order.profile)
     values = profiles.read_toml(path)
     text = path.read_text(encoding="utf-8")
+    # A command that root gives and the service must mean the same folders.
+    models = {"folder": f"{state}/models", "state": f"{state}/state/palpate"}
+    given = values.get("models", models)
+    if isinstance(given, dict) and (missing := models.keys() - given.keys()):
+        raise ConfigError(
+            f"{path}: [models] names no {' and no '.join(sorted(missing))}",
+            remedy=", ".join(f'{key} = "{models[key]}"' for key in sorted(missing)),
+        )
     if "models" not in values:
-        # A command that root gives and the service must mean the same folders.
-        models = {"folder": f"{state}/models", "state": f"{state}/state/palpate"}
         values["models"] = models
         text = (
             f"{text.rstrip()}\n\n# The bundles of this station, and what it serves.\n[models]\n"

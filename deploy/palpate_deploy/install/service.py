@@ -72,7 +72,7 @@ def install(order: InstallOrder) -> None:
         texts = {str(profile_path(name)): profile, **plan.files()}
         edition = Edition.of(present_version(), program, order.allowed, texts)
         _check_nothing_in_the_way(host, old, texts, profiles.profile_path(order.profile))
-        if old.now is None and host.root == Path("/") and "router" in plan.profile.processes:
+        if old.now is None and host.is_this_host and "router" in plan.profile.processes:
             check_free(plan.profile.router.listen)
         if edition == old.now and all(
             host.look(path, {text}) is Found.OURS for path, text in texts.items()
@@ -100,7 +100,7 @@ def roll_back(name: str, root: Path) -> None:
                 remedy="palpate install with another profile, or by another version's palpate",
             )
         _check_nothing_in_the_way(host, old, old.before.texts, None)
-        if host.root == Path("/"):
+        if host.is_this_host:
             _check_runs(old.before)
         _change(books, Ledger(now=old.before, before=old.now), "")
         print(f"  palpate {old.before.palpate} again, by {old.before.program}")
