@@ -24,7 +24,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tests.install.image import PLAIN, copy, inside
+from tests.install.booted import NotHere, under_systemd
+from tests.install.image import copy, inside
+from tests.install.scores import scores
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "docs" / "results" / "install.json"
@@ -37,6 +39,7 @@ class Steps:
 
     def __init__(self) -> None:
         self.done: list[dict[str, Any]] = []
+        self.part = "image"
 
     @contextlib.contextmanager
     def step(self, what: str) -> Iterator[None]:
@@ -46,7 +49,7 @@ class Steps:
         yield
         took_s = time.monotonic() - began_s
         print(f"    {took_s:.1f} s", flush=True)
-        self.done.append({"step": what, "seconds": round(took_s, 1)})
+        self.done.append({"part": self.part, "step": what, "seconds": round(took_s, 1)})
 
 
 def run(*command: str | Path, quiet: bool = True, **options: Any) -> None:
@@ -136,14 +139,19 @@ def prove(suite: str, work: Path) -> dict[str, Any]:
             shutil.move(file, wheels / file.name)
         for left in (lab / "tmp").iterdir():
             shutil.rmtree(left) if left.is_dir() else left.unlink()
+    steps.part = "chroot"
     report = work / "station.json"
     in_namespaces("tests.install.station", lab, wheels, report)
     found = json.loads(report.read_text(encoding="utf-8"))
     steps.done += found.pop("steps")
+    steps.part = "containers"
     with steps.step("each step of the Dockerfile, then its station"):
         found["image"] = _image(base, work, wheels)
     with steps.step("podman reads the quadlets"):
         found["quadlets"] = _quadlets(lab, work)
+    steps.part = "systemd"
+    found["booted"] = _booted(work, steps)
+    found["scores"] = scores()
     return {
         "debian": suite,
         "cores": os.cpu_count(),
@@ -202,6 +210,19 @@ def _copy_into(root: Path, words: list[str], roots: dict[str, Path], context: Pa
         shutil.copy(file, root / target.strip("/"))
 
 
+def _booted(work: Path, steps: Steps) -> dict[str, Any]:
+    """A Debian with palpate again, and with a systemd that runs."""
+    root = work / "booted"
+    with steps.step("apt-get install systemd"):
+        copy(work / "lab", root)
+        copy(work / "stage-1" / "opt" / "palpate", root / "opt" / "palpate")
+        online(root, "apt-get update && apt-get install -y --no-install-recommends systemd")
+    try:
+        return under_systemd(root, steps.step)
+    except NotHere as error:
+        return {"not_tried": str(error)}
+
+
 def _quadlets(lab: Path, work: Path) -> dict[str, Any]:
     """What podman's generator makes of the files of deploy/containers."""
     root = work / "podman"
@@ -217,16 +238,20 @@ def _quadlets(lab: Path, work: Path) -> dict[str, Any]:
         check=False,
     )
     version = subprocess.run(
-        inside(root, ["podman", "--version"]), capture_output=True, text=True, check=False
-    ).stdout.split()
+        inside(root, ["dpkg-query", "--show", "--showformat=${Version}", "podman"]),
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
     return {
-        "podman": version[-1] if version else "",
+        "podman": version.partition("+")[0],
         "status": done.returncode,
         "units": re.findall(r"^---(\S+)---$", done.stdout, flags=re.MULTILINE),
-        "complaints": done.stderr.strip().splitlines(),
+        "complaints": [
+            line for line in done.stderr.splitlines() if "Loading source unit file" not in line
+        ],
     }
 
 
 if __name__ == "__main__":
-    assert PLAIN
     main()

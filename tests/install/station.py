@@ -99,6 +99,7 @@ def running(root: Path, name: str, unit: UnitFile) -> Iterator[NoticeBoard]:
 def main(root: Path, wheels: Path, report: Path) -> None:
     """The whole way; writes the report."""
     steps, found = Steps(), {}
+    steps.part = "chroot"
     image.enter(root)
     shutil.copytree(wheels, root / "tmp" / "wheels")
     shutil.copytree(ROOT / "docs" / "examples", root / "tmp" / "examples")

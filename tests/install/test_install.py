@@ -16,7 +16,7 @@ from tests.install.image import contents, difference
 from palpate.errors import ConfigError, LinkError, MissingExtraError
 from palpate_deploy.install import service
 from palpate_deploy.install.ledger import InstallError
-from palpate_deploy.install.plan import InstallOrder
+from palpate_deploy.install.plan import InstallOrder, present_version
 from palpate_deploy.install.units import ServicePlan
 from palpate_deploy.station.profile import load_profile
 
@@ -469,6 +469,26 @@ def test_all_is_as_it_was_when_systemd_refuses(
     with pytest.raises(InstallError):
         service.uninstall("lab", root, purge=True)
     assert difference(installed, contents(root)) == []
+
+
+def test_rollback_to_a_program_that_is_another_one_by_now_is_refused(
+    root: Path, tmp_path: Path, install: Install, this_host: Path
+) -> None:
+    program = tmp_path / "palpate"
+    install(program=str(program))
+    install(program="/opt/palpate-2/bin/palpate")
+    installed = contents(root)
+    with pytest.raises(InstallError, match="No such file"):
+        service.roll_back("lab", root)
+    program.write_text("#!/bin/sh\necho palpate 99.0\n")
+    program.chmod(0o755)
+    with pytest.raises(InstallError, match="is now: palpate 99.0") as caught:
+        service.roll_back("lab", root)
+    assert f"install palpate {present_version()} there again" in caught.value.remedy
+    assert difference(installed, contents(root)) == []
+    program.write_text(f"#!/bin/sh\necho palpate {present_version()}\n")
+    service.roll_back("lab", root)
+    assert str(program) in (root / UNIT).read_text("utf-8")
 
 
 def test_wish_to_start_with_the_host_goes_too(root: Path, install: Install) -> None:

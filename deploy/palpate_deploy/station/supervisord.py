@@ -46,6 +46,16 @@ class _Options(ServerOptions):  # type: ignore[misc]
             self.watch.ended(process, status)
         return pid, status
 
+    def make_http_servers(self, supervisord: Supervisor) -> Any:
+        # The socket keeps its owner, which supervisor says by a chown that changes nothing. Where a
+        # service manager forbids that call altogether, supervisord would end here.
+        real = os.chown
+        os.chown = lambda *_, **__: None
+        try:
+            return super().make_http_servers(supervisord)
+        finally:
+            os.chown = real
+
 
 def _processes(supervisord: Supervisor) -> Iterator[Any]:
     for group in (supervisord.process_groups or {}).values():

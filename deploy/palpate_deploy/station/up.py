@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import signal
 import threading
 import time
@@ -55,6 +56,8 @@ def run_up(profile: Profile, name: str) -> int:
     check_packages(profile)
     console = Console()
     manager = ServiceManager()
+    # A service manager that finds it hanging asks where, before it kills it.
+    faulthandler.register(signal.SIGUSR1, all_threads=True)
     stop = stop_on_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     end_with_parent()
     with Supervisor(profile, name) as supervisor:
