@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel release clean sbom audit
+.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel release clean sbom audit debian
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -82,6 +82,10 @@ fuzz: $(VENV)/.dev  ## fuzz the gateway's decoders: make fuzz DECODER=kms40 SECO
 	@$(pip_install) -e '.[fuzz]' | $(show)
 	$(BIN)/python -m tests.fuzz.run $(or $(DECODER),all) --seconds $(or $(SECONDS),600)
 
+debian: $(VENV)/.dev  ## install on a bare Debian, run a robot, uninstall: what is left? | 10 min, as root, Linux only
+	$(BIN)/python -m tests.install.debian
+	$(BIN)/python docs/make_install.py
+
 mutants: $(VENV)/.dev  ## plant small faults in the central modules: which do the tests notice? | 1 h, Linux only
 	@$(pip_install) -e '.[mutants]' | $(show)
 	$(BIN)/python -m tests.mutation.run $(MODULES)
@@ -95,6 +99,7 @@ docs: $(VENV)/.dev  ## regenerate generated pages and pictures, check all links 
 	$(BIN)/python docs/make_indenters.py
 	$(BIN)/python docs/make_failures.py
 	$(BIN)/python docs/make_house.py
+	$(BIN)/python docs/make_install.py
 	$(BIN)/python docs/make_models.py
 	$(BIN)/python docs/make_study.py
 	$(BIN)/python docs/make_numbers.py

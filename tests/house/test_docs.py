@@ -138,6 +138,7 @@ def test_palpate_commands_exist(
         "make_asyncapi.py",
         "make_failures.py",
         "make_house.py",
+        "make_install.py",
         "make_models.py",
         "make_numbers.py",
         "make_serving.py",

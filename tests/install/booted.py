@@ -27,7 +27,10 @@ PALPATE = "/opt/palpate/bin/palpate"
 PATIENCE_S = 300.0
 PROFILE = VIRTUAL.replace('"recorder"]', '"fem", "recorder"]')
 TAKEN = "-sys_time,-sys_boot,-sys_module,-sys_rawio,-syslog"
-_OF_SYSTEMD = re.compile(r". /(etc/(machine-id|\.pwd\.lock|\.updated)|var/(lib/(private|systemd)|cache/(private|ldconfig)|log|\.updated)).*")
+_OF_SYSTEMD = re.compile(
+    r". /(?:etc/(?:machine-id|\.pwd\.lock|\.updated)"
+    r"|var/(?:lib/(?:private|systemd)|cache/(?:private|ldconfig)|log|\.updated))(?:/.*)?"
+)
 """What a system writes while it runs, whatever runs on it."""
 
 
@@ -72,7 +75,7 @@ class Booted:
         self._group.mkdir()
         inner = [sys.executable, "-m", "tests.install.booted", str(root)]
         namespaces = ["--mount", "--net", "--pid", "--ipc", "--uts", "--cgroup", "--fork"]
-        join = f"echo $$ > {self._group}/cgroup.procs; exec \"$@\""
+        join = f'echo $$ > {self._group}/cgroup.procs; exec "$@"'
         self._process = subprocess.Popen(
             ["sh", "-c", join, "sh", "unshare", *namespaces, "--kill-child", *inner],
             cwd=ROOT,
@@ -90,7 +93,9 @@ class Booted:
 
         try:
             until(first, "systemd is there")
-            until(lambda: self.run("systemctl", "is-system-running").strip() == "running", "it runs")
+            until(
+                lambda: self.run("systemctl", "is-system-running").strip() == "running", "it runs"
+            )
         except BaseException:
             self.__exit__()
             raise
@@ -109,7 +114,15 @@ class Booted:
 
     def run(self, *command: str, status: int | None = None) -> str:
         """Output of a command in the system; with ``status`` it must end so."""
-        where = ["nsenter", f"--target={self._first}", "--mount", "--net", "--pid", "--ipc", "--uts"]
+        where = [
+            "nsenter",
+            f"--target={self._first}",
+            "--mount",
+            "--net",
+            "--pid",
+            "--ipc",
+            "--uts",
+        ]
         variables = [f"{key}={value}" for key, value in image.PLAIN.items()]
         done = subprocess.run(
             [*where, "--cgroup", "env", "-i", "--chdir=/", *variables, *command],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -61,7 +61,7 @@ def install(root: Path, profile: Path) -> Install:
 
 
 @pytest.fixture
-def this_host(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def this_host(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Let the system in the folder be this host, run by systemd; the file with what it was told."""
     told = tmp_path / "systemctl.log"
     told.touch()
@@ -74,4 +74,4 @@ def this_host(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
     monkeypatch.setattr("palpate_deploy.install.ledger.Host.is_this_host", True)
     monkeypatch.setattr("palpate_deploy.install.ledger.Host.is_running", True)
-    yield told
+    return told

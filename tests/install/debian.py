@@ -44,11 +44,11 @@ class Steps:
     @contextlib.contextmanager
     def step(self, what: str) -> Iterator[None]:
         """Do a step."""
-        print(f"{what} ...", flush=True)
+        sys.stderr.write(f"{what} ...\n")
         began_s = time.monotonic()
         yield
         took_s = time.monotonic() - began_s
-        print(f"    {took_s:.1f} s", flush=True)
+        sys.stderr.write(f"    {took_s:.1f} s\n")
         self.done.append({"part": self.part, "step": what, "seconds": round(took_s, 1)})
 
 
@@ -105,7 +105,7 @@ def main() -> None:
     finally:
         if given.work is None:
             shutil.rmtree(work)
-    print(f"wrote {given.out}")
+    sys.stderr.write(f"wrote {given.out}\n")
 
 
 def prove(suite: str, work: Path) -> dict[str, Any]:

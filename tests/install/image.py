@@ -24,7 +24,7 @@ PLAIN = {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
 
 
 def mount(*words: str) -> None:
-    """mount(8)."""
+    """Mount a file system; a failure is an error."""
     subprocess.run(["mount", *words], check=True)
 
 

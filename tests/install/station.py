@@ -98,7 +98,8 @@ def running(root: Path, name: str, unit: UnitFile) -> Iterator[NoticeBoard]:
 
 def main(root: Path, wheels: Path, report: Path) -> None:
     """The whole way; writes the report."""
-    steps, found = Steps(), {}
+    steps = Steps()
+    found: dict[str, Any] = {}
     steps.part = "chroot"
     image.enter(root)
     shutil.copytree(wheels, root / "tmp" / "wheels")

@@ -20,8 +20,7 @@ Units = dict[str, Path]
 
 @pytest.fixture
 def units(case: str, tmp_path: Path) -> Units:
-    """Unit files of a case by their kind, ``palpate`` or ``palpate-fem``, with a command that is
-    there."""
+    """Unit files of a case by kind, ``palpate`` or ``palpate-fem``; their command is there."""
     found = {}
     for path, text in plan_of_case(case).files().items():
         if path.endswith(".service"):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -101,7 +102,7 @@ def test_ready_comes_after_every_process_and_a_hung_one_is_replaced(
     assert _process_of(root, "features") not in (0, old)
     # The station itself has been alive all the time.
     alive_s = [at_s for at_s, line in board.lines if line == "WATCHDOG=1"]
-    gaps_s = [b - a for a, b in zip(alive_s, alive_s[1:], strict=False)]
+    gaps_s = [b - a for a, b in pairwise(alive_s)]
     assert max(gaps_s) < LIMIT
     asked_s = time.monotonic()
     station.terminate()

@@ -127,7 +127,7 @@ def write_containers(order: InstallOrder, folder: Path) -> None:
 def _compose(plan: ServicePlan, containers: Sequence[_Container], image: str) -> str:
     # Every string is written as JSON, which is YAML, too.
     lines = [
-        f"# Written by palpate install --containers. Station {plan.name}: docker compose up --detach",
+        "# Written by palpate install --containers. To start it: docker compose up --detach",
         f"name: {json.dumps(f'palpate-{plan.name}')}",
         "services:",
     ]

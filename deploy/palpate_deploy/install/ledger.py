@@ -20,9 +20,14 @@ from typing import Literal, Self
 from pydantic import ConfigDict, Field, ValidationError
 
 from palpate.config import StrictConfig
-from palpate.errors import ConfigError, PalpateError
-from palpate_deploy.install.units import PROFILES_FOLDER, UNITS_FOLDER, profile_path, rules_path
-from palpate_deploy.install.units import unit_name
+from palpate.errors import PalpateError
+from palpate_deploy.install.units import (
+    PROFILES_FOLDER,
+    UNITS_FOLDER,
+    profile_path,
+    rules_path,
+    unit_name,
+)
 
 LEDGERS_FOLDER = PROFILES_FOLDER / "installed"
 _STAGED = ".palpate-new"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 from palpate.config import TLS_FILES
 from palpate_deploy.install.needs import HostNeeds
@@ -18,6 +18,8 @@ from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.supervision import STOP_WAIT_S
 
 FEM = "fem"
+
+_RULES = Path(__file__).with_name("sensors.rules")
 
 PROFILES_FOLDER = PurePosixPath("/etc/palpate")
 UNITS_FOLDER = PurePosixPath("/etc/systemd/system")
@@ -89,7 +91,7 @@ class ServicePlan:
         if self.solves:
             texts[str(UNITS_FOLDER / unit_name(self.name, solver=True))] = _solver_unit(self)
         if self.needs.serial:
-            texts[str(rules_path(self.name))] = _RULES
+            texts[str(rules_path(self.name))] = _RULES.read_text(encoding="utf-8")
         return texts
 
 
@@ -124,7 +126,7 @@ def _station_unit(plan: ServicePlan) -> str:
     if needs.serial:
         modules = ["modprobe@usbserial.service", "modprobe@cdc_acm.service"]
         relations += [
-            "# The kinds of devices below are looked up when the unit starts; a sensor may come later.",
+            "# The kinds of devices below are looked up at the start; a sensor may come later.",
             f"Wants={' '.join(modules)}",
         ]
         devices = ["SupplementaryGroups=dialout", *_device_lines(needs.serial)]
@@ -133,10 +135,10 @@ def _station_unit(plan: ServicePlan) -> str:
         unit_name(name),
         [f"After={' '.join(['network.target', 'time-sync.target', *modules])}", *relations],
         [
-            "# READY when every process has made its first turn, WATCHDOG while their supervisor answers:",
-            "# it ends and starts again what hangs. If it hangs itself, systemd starts all of it again.",
+            "# READY when every process has made its first turn, WATCHDOG while their supervisor",
+            "# answers: it replaces what hangs. If it hangs itself, systemd starts all again.",
             f"ExecStart={plan.program} up --profile {profile_path(name)}",
-            "# SIGTERM to `palpate up` alone, which stops gateway, features, recorder, router in order.",
+            "# SIGTERM to `palpate up` alone: it stops the gateway first, the router last.",
             "KillMode=mixed",
             f"TimeoutStopSec={plan.stop_s}",
             f"MemoryMax={plan.memory_mb}M",
@@ -149,7 +151,7 @@ def _station_unit(plan: ServicePlan) -> str:
         ],
         [
             "MemoryDenyWriteExecute=yes",
-            "# The gateway stays on one core. ProcSubset=pid would hide /proc/stat, which tells the idlest.",
+            "# The gateway stays on one core; ProcSubset=pid would hide which one is idle.",
             "SystemCallFilter=sched_setaffinity",
             *devices,
             *_network((*needs.networks, *needs.device_networks), can=needs.can),
@@ -301,20 +303,3 @@ SystemCallArchitectures=native
 SystemCallFilter=@system-service
 SystemCallFilter=~@privileged @resources
 SystemCallErrorNumber=EPERM"""
-
-_RULES = """\
-# Sensors on serial ports. Written by `palpate install`, which reads them in:
-#   udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=usb-serial --action=add
-# Not tried with an adapter. Names that stay the same, /dev/serial/by-id/..., are made by udev itself.
-
-# USB serial ports belong to the group dialout, also where the distribution has another one.
-ACTION=="add|change", SUBSYSTEM=="tty", KERNEL=="ttyUSB[0-9]*|ttyACM[0-9]*", GROUP="dialout", MODE="0660"
-
-# FTDI adapters hold bytes back for up to 16 ms, so that samples arrive in clumps: 1 ms instead.
-# The driver's name says what it is; no numbers of makers are needed. ttyACM has no such timer.
-ACTION=="add|bind", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"
-
-# ModemManager may take a new ttyACM for a modem and write to it for some seconds. If this host has no
-# modem, remove the mark of comment:
-# ACTION=="add|change", SUBSYSTEM=="tty", KERNEL=="ttyACM[0-9]*", ENV{ID_MM_DEVICE_IGNORE}="1"
-"""
