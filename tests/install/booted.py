@@ -234,7 +234,7 @@ def hangs(
     """Stop one after the other (SIGSTOP); how long until it works again [s]."""
     with step("SIGSTOP features: the supervisor replaces it"):
         old = system.pid_of("features")
-        system.run("kill", "-STOP", old, status=0)
+        system.run("sh", "-c", f"kill -STOP {old}", status=0)
         yield "features", round(until(lambda: system.pid_of("features") not in ("", old), "new"), 1)
         assert system.property(unit, "NRestarts") == "0"
     for name in (unit, solver):

@@ -339,7 +339,7 @@ def test_only_root_installs_on_this_host_and_anyone_may_look(
         ('[recorder]\nout = "../other"', "writes into /var/lib/palpate/lab only"),
         ('[models]\nfolder = "/srv/models"', "[models] names no state"),
         (
-            '[models]\nfolder = "/home/me/models"\nstate = "/var/lib/palpate/lab/state"',
+            '[models]\nfolder = "~/models"\nstate = "/var/lib/palpate/lab/state"',
             "does not see /home",
         ),
         ('[models]\nfolder = "/srv/models"\nstate = "/srv/state"', "writes into"),
@@ -383,6 +383,17 @@ def test_router_for_other_hosts_needs_to_know_which(
     assert "IPAddressAllow=localhost 10.0.0.0/8" in unit
     with pytest.raises(ConfigError, match="no network"):
         install(tmp_path / "lab.toml", allowed=("everyone",))
+
+
+def test_certificate_that_is_not_there_is_named(
+    root: Path, tmp_path: Path, install: Install, this_host: Path
+) -> None:
+    (tmp_path / "lab.toml").write_text(
+        f'[link.tls]\nroot_ca_certificate = "{tmp_path}/ca.pem"\n'
+        f'certificate = "{tmp_path}/lab.toml"\nprivate_key = "{tmp_path}/lab.toml"\n'
+    )
+    with pytest.raises(ConfigError, match=r"ca\.pem does not exist"):
+        install(tmp_path / "lab.toml")
 
 
 def test_variable_of_the_shell_is_refused(

@@ -19,6 +19,8 @@ from palpate_deploy.install import service
 from palpate_deploy.install.ledger import Host, InstallError
 from palpate_deploy.install.plan import InstallOrder
 
+pytestmark = pytest.mark.slow
+
 _STEPS = {
     "open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.chmod", "os.link", "os.symlink",
     "shutil.rmtree",

@@ -11,7 +11,7 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
-from palpate.errors import PalpateError
+from palpate.errors import ConfigError, PalpateError
 from palpate_deploy.install.ledger import (
     Books,
     Edition,
@@ -72,8 +72,8 @@ def install(order: InstallOrder) -> None:
         texts = {str(profile_path(name)): profile, **plan.files()}
         edition = Edition.of(present_version(), program, order.allowed, texts)
         _check_nothing_in_the_way(host, old, texts, profiles.profile_path(order.profile))
-        if old.now is None and host.is_this_host and "router" in plan.profile.processes:
-            check_free(plan.profile.router.listen)
+        if host.is_this_host:
+            _check_this_host(plan.profile, first=old.now is None)
         if edition == old.now and all(
             host.look(path, {text}) is Found.OURS for path, text in texts.items()
         ):
@@ -185,6 +185,15 @@ def _check_rights(root: Path) -> None:
             "only root may write the units of this host",
             remedy="use sudo; or look first with --dry-run",
         )
+
+
+def _check_this_host(profile: profiles.Profile, *, first: bool) -> None:
+    """Check what the units would fail on at once: a port in use, a certificate that is missing."""
+    if first and "router" in profile.processes:
+        check_free(profile.router.listen)
+    for path in () if profile.link.tls is None else profile.link.tls.model_dump().values():
+        if not path.is_file():
+            raise ConfigError(f"{path} does not exist", remedy="set [link.tls]")
 
 
 def _check_nothing_in_the_way(
