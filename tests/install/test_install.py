@@ -218,6 +218,22 @@ def test_changed_unit_is_neither_overwritten_nor_removed_unless_asked(
     assert not (root / "etc/palpate").exists()
 
 
+def test_changed_unit_that_is_needed_no_more_stops_an_upgrade(
+    root: Path, profile: Path, install: Install
+) -> None:
+    profile.write_text(VIRTUAL.replace('"recorder"', '"recorder", "fem"'))
+    install()
+    solver = root / "etc/systemd/system/palpate-fem@lab.service"
+    solver.write_text("[Service]\nExecStart=/bin/mine\n")
+    profile.write_text(VIRTUAL)
+    before = contents(root)
+    with pytest.raises(InstallError, match=r"palpate-fem@lab\.service is changed"):
+        install()
+    assert difference(before, contents(root)) == []
+    solver.unlink()
+    install()
+
+
 def test_changes_by_systemctl_edit_stay_until_purge(root: Path, install: Install) -> None:
     install()
     override = root / f"{UNIT}.d" / "override.conf"

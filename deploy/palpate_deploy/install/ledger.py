@@ -380,3 +380,7 @@ def _stage(file: Path, text: str, *, mode: int = 0o644) -> Path:
 
 def _write(file: Path, text: str, *, mode: int = 0o644) -> None:
     _stage(file, text, mode=mode).replace(file)
+    # What is renamed after this must not reach the disk before it.
+    folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY)
+    os.fsync(folder)
+    os.close(folder)

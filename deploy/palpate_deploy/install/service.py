@@ -199,8 +199,9 @@ def _check_this_host(profile: profiles.Profile, *, first: bool) -> None:
 def _check_nothing_in_the_way(
     host: Host, old: Ledger, texts: dict[str, str], source: Path | None
 ) -> None:
-    """Check that every file to be written is absent, or as an install has written it."""
-    for path in texts:
+    """Check that every file to be written, or to go, is absent or as an install has written it."""
+    gone = {} if old.now is None else old.now.texts
+    for path in dict.fromkeys((*texts, *gone)):
         found = host.look(path, old.written(path))
         if found in (Found.NOTHING, Found.OURS):
             continue
