@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 PATIENCE_S = 120.0
 """Far more than it takes: this host may be busy."""
 
-LIMIT = 30
+LIMIT = 20
 """``WatchdogSec`` of the units [s]."""
 
 

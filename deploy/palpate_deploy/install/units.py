@@ -141,6 +141,7 @@ def _station_unit(plan: ServicePlan) -> str:
             "# SIGTERM to `palpate up` alone: it stops the gateway first, the router last.",
             "KillMode=mixed",
             f"TimeoutStopSec={plan.stop_s}",
+            "WatchdogSec=20",
             f"MemoryMax={plan.memory_mb}M",
             "",
             f"StateDirectory=palpate/{name}",
@@ -180,6 +181,7 @@ def _solver_unit(plan: ServicePlan) -> str:
         [
             f"ExecStart={plan.program} run {FEM} --profile {profile_path(name)}",
             "TimeoutStopSec=15",
+            "WatchdogSec=10",
             f"MemoryMax={plan.solver_memory_mb}M",
             "",
             "# Kernels that Warp has compiled.",
@@ -261,10 +263,9 @@ def _network(networks: Sequence[str], *, can: bool = False) -> list[str]:
 
 _RESTART = """\
 TimeoutStartSec=120
-WatchdogSec=30
 # One that hangs writes the stacks of its threads into the journal, then it is killed.
 WatchdogSignal=SIGUSR1
-TimeoutAbortSec=5
+TimeoutAbortSec=2
 LimitCORE=0
 Restart=on-failure
 RestartSec=1
