@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -147,3 +149,37 @@ def test_every_process_has_its_time_to_stop(case: str, units: Units) -> None:
 def test_wrong_profile_is_not_started_again_and_again(units: Units) -> None:
     for unit in units.values():
         assert UnitFile.read(unit).one("RestartPreventExitStatus") == "2"
+
+
+_DOUBLE = """
+import ctypes, sys
+PR_SET_MDWE = 65
+if sys.argv[2:] and ctypes.CDLL(None).prctl(PR_SET_MDWE, 1, 0, 0, 0):
+    sys.exit(77)
+import numpy as np, warp as wp
+wp.config.kernel_cache_dir, wp.config.quiet = sys.argv[1], True
+@wp.kernel
+def double(values: wp.array(dtype=float)):
+    values[wp.tid()] = 2.0 * values[wp.tid()]
+values = wp.array(np.ones(4, np.float32), device="cpu")
+wp.launch(double, dim=4, inputs=[values], device="cpu")
+assert values.numpy().tolist() == [2.0] * 4
+"""
+
+
+@pytest.mark.slow
+def test_warp_cannot_do_without_writing_code(tmp_path: Path) -> None:
+    """Should this fail one day, the unit of the finite elements can be closed further."""
+    program = tmp_path / "double.py"
+    program.write_text(_DOUBLE)
+    command = [sys.executable, str(program), str(tmp_path)]
+    free = subprocess.run(command, capture_output=True, text=True, check=False)
+    if "No module named 'warp'" in free.stderr:
+        pytest.skip("warp is not installed (extra fem)")
+    assert free.returncode == 0, free.stderr
+    for cached in tmp_path.glob("[0-9]*"):
+        shutil.rmtree(cached)
+    shut = subprocess.run([*command, "shut"], capture_output=True, text=True, check=False)
+    if shut.returncode == 77:
+        pytest.skip("this kernel has no PR_SET_MDWE")
+    assert "Failed to find forward kernel" in shut.stderr
