@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 
-from palpate.config import check_name
+from palpate.config import is_name
 from palpate.errors import ConfigError
 from palpate_deploy.install.needs import (
     UNSEEN_FOLDERS,
@@ -59,10 +59,11 @@ def checked_name(name: str) -> str:
     Raises:
         ConfigError: It cannot.
     """
-    check_name(name, "station")
-    if len(name) > _LONGEST_NAME:
+    if not is_name(name) or len(name) > _LONGEST_NAME:
         raise ConfigError(
-            f"station {name!r} is too long for a unit", remedy=f"at most {_LONGEST_NAME} characters"
+            f"station {name!r} cannot be part of the name of a unit",
+            remedy=f"name it otherwise (--name): 1 to {_LONGEST_NAME} of a-z, 0-9, '-', '_', "
+            "starting with a letter or digit",
         )
     return name
 
