@@ -181,6 +181,33 @@ def test_many_at_once_leave_one_whole_installation(root: Path, profile: Path) ->
     assert difference(before, contents(root)) == []
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a disk")
+def test_disk_that_is_mounted_among_the_records_is_not_emptied(
+    root: Path, install: Install
+) -> None:
+    install()
+    runs = root / "var/lib/palpate/lab/my runs"
+    runs.mkdir(parents=True)
+    program = f"""
+import os
+from pathlib import Path
+from palpate_deploy.install import service
+from palpate_deploy.install.ledger import InstallError
+runs = Path({str(runs)!r})
+assert os.system(f"mount -t tmpfs tmpfs '{{runs}}'") == 0
+(runs / "lab-1.mcap").touch()
+try:
+    service.uninstall("lab", Path({str(root)!r}), purge=True)
+except InstallError as error:
+    assert "would be emptied" in error.problem, error
+else:
+    raise AssertionError("it was emptied")
+assert (runs / "lab-1.mcap").exists()
+"""
+    _in_a_mount_namespace(program)
+    assert (root / "etc/palpate/lab.toml").exists()
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a small disk")
 def test_full_disk_leaves_all_as_it_was(tmp_path: Path, profile: Path) -> None:
     """A disk of 160 kB in a mount namespace, filled but for ever more pages."""
@@ -218,6 +245,10 @@ for pages in range(40):
 assert 4 < failed < 38, failed
 """
     (tmp_path / "disk").mkdir()
+    _in_a_mount_namespace(program)
+
+
+def _in_a_mount_namespace(program: str) -> None:
     done = subprocess.run(
         ["unshare", "--mount", sys.executable, "-c", program],
         capture_output=True,

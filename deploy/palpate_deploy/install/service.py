@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import errno
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -284,7 +285,8 @@ def _check_no_mounts(host: Host, folders: Sequence[str]) -> None:
     except OSError:
         return
     for line in lines:
-        mounted = Path(line.split()[4].encode().decode("unicode_escape"))
+        # A space is written as \040 there.
+        mounted = Path(re.sub(r"\\(\d{3})", lambda found: chr(int(found[1], 8)), line.split()[4]))
         for folder in folders:
             if mounted.is_relative_to(host.at(folder)):
                 raise InstallError(
