@@ -24,6 +24,7 @@ from palpate.codec.base import (
     vector3_to_wire,
 )
 from palpate.messages import (
+    ErrorBounds,
     FeatureEstimate,
     FieldEstimate,
     FloatArray,
@@ -75,6 +76,41 @@ def _check_normal(normal: FloatArray, sd: float) -> float:
     return sd
 
 
+_BOUNDS = ("force_magnitude", "force", "contact_location", "displacement")
+
+
+def _bounds_from_wire(msg: estimates_pb2.ErrorBounds) -> ErrorBounds:
+    values = [getattr(msg, name) if msg.HasField(name) else None for name in _BOUNDS]
+    return _checked_bounds(ErrorBounds(msg.level, *values, other_sensors=msg.other_sensors))
+
+
+def _bounds_to_wire(bounds: ErrorBounds) -> estimates_pb2.ErrorBounds:
+    _checked_bounds(bounds)
+    return estimates_pb2.ErrorBounds(
+        level=bounds.level,
+        force_magnitude=bounds.force_magnitude,
+        force=bounds.force,
+        contact_location=bounds.contact_location,
+        displacement=bounds.displacement,
+        other_sensors=bounds.other_sensors,
+    )
+
+
+_BOUND_MAX = 1e30
+"""Far beyond any error; and what a float32 field takes."""
+
+
+def _checked_bounds(bounds: ErrorBounds) -> ErrorBounds:
+    given = (
+        bounds.force_magnitude, bounds.force, bounds.contact_location, bounds.displacement,
+    )  # fmt: skip
+    if not 0.0 < bounds.level < 1.0:
+        reject("bounds", f"bounds hold in a share of {bounds.level}, not between 0 and 1")
+    if not all(value is None or 0.0 <= value <= _BOUND_MAX for value in given):
+        reject("bounds", f"bounds {given} are not finite, or negative")
+    return bounds
+
+
 def _features_from_wire(msg: estimates_pb2.FeatureEstimate) -> FeatureEstimate:
     location = location_sd = None
     if msg.HasField("contact_location"):
@@ -121,7 +157,15 @@ def _features_from_wire(msg: estimates_pb2.FeatureEstimate) -> FeatureEstimate:
         centre_sd,
         normal,
         normal_sd,
+        _feature_bounds(msg) if msg.HasField("bounds") else None,
     )
+
+
+def _feature_bounds(msg: estimates_pb2.FeatureEstimate) -> ErrorBounds:
+    bounds = _bounds_from_wire(msg.bounds)
+    if bounds.contact_location is not None and not msg.HasField("contact_location"):
+        reject("bounds", "a bound of contact_location comes without contact_location")
+    return bounds
 
 
 def _features_encode(estimate: FeatureEstimate) -> bytes:
@@ -163,6 +207,10 @@ def _features_encode(estimate: FeatureEstimate) -> bytes:
             reject("normal", "contact_normal needs contact_normal_sd and in_contact")
         vector3_to_wire(estimate.contact_normal, msg.contact_normal, "contact_normal")
         msg.contact_normal_sd = _check_normal(estimate.contact_normal, estimate.contact_normal_sd)
+    if (bounds := estimate.bounds) is not None:
+        if bounds.contact_location is not None and estimate.contact_location is None:
+            reject("bounds", "a bound of contact_location needs contact_location")
+        msg.bounds.CopyFrom(_bounds_to_wire(bounds))
     return msg.SerializeToString()
 
 
@@ -202,6 +250,7 @@ def _field_from_wire(msg: estimates_pb2.FieldEstimate) -> FieldEstimate:
         *_check_bundle(msg.bundle_name, msg.bundle_version),
         coefficients,
         msg.basis_sha256,
+        _bounds_from_wire(msg.bounds) if msg.HasField("bounds") else None,
     )
 
 
@@ -239,6 +288,8 @@ def _field_encode(estimate: FieldEstimate) -> bytes:
     payload += tail.SerializeToString()
     if coefficients is not None:
         payload += splice(12, coefficients) + delimited(13, estimate.basis_sha256)
+    if estimate.bounds is not None:
+        payload += delimited(14, _bounds_to_wire(estimate.bounds).SerializeToString())
     return payload
 
 

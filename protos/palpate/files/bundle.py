@@ -26,6 +26,7 @@ import numpy.typing as npt
 from palpate.config import check_name
 from palpate.errors import BundleError, ConfigError, printable
 from palpate.files.bounded import arrays_of_npz, parse_json, read_regular
+from palpate.files.intervals import Intervals, parse_intervals
 from palpate.files.tasks import SENSOR_TYPE, TaskContract, check_tensors
 from palpate.files.training_range import (
     RANGE_BYTES_MAX,
@@ -81,6 +82,7 @@ class Manifest:
             displacement = mean + coefficients x modes; empty = no output ``coefficients``.
         sensor_serials: Serial numbers of the sensors that it was made for; one that ends in ``*``
             stands for all that begin so. Estimates of any other sensor are flagged.
+        intervals: How far its estimates may be off; None = not known.
     """
 
     name: str
@@ -106,6 +108,7 @@ class Manifest:
     range_file_sha256: str = ""
     basis: Mapping[str, str] = field(default_factory=dict)
     sensor_serials: tuple[str, ...] = ()
+    intervals: Intervals | None = None
 
 
 _LATER_KEYS = (
@@ -115,6 +118,7 @@ _LATER_KEYS = (
     "range_file_sha256",
     "basis",
     "sensor_serials",
+    "intervals",
 )
 """Manifests were written before these keys; one that says nothing of them must keep its bytes."""
 
@@ -187,6 +191,8 @@ def parse_manifest(text: bytes, where: Path) -> Manifest:
             )
         if "sensor_serials" in values:
             values["sensor_serials"] = _serials(values["sensor_serials"])
+        if values.get("intervals") is not None:
+            values["intervals"] = parse_intervals(values["intervals"], values["task"])
         manifest = Manifest(**values)
         _check_later_keys(manifest)
         if manifest.contract_version != BUNDLE_CONTRACT_VERSION:
@@ -212,6 +218,8 @@ def _check_later_keys(manifest: Manifest) -> None:
     known = manifest.training_range
     if bool(manifest.range_file_sha256) != (known is not None and known.combinations):
         raise ValueError("training_range.combinations and range_file_sha256 do not agree")
+    if manifest.intervals is not None and not manifest.range_file_sha256:
+        raise ValueError("intervals need the distance from the training rows, of range_file_sha256")
     outputs = {tensor.name for tensor in manifest.outputs}
     names = {"mean", "modes"} if "coefficients" in outputs else set()
     if set(manifest.basis) != names:

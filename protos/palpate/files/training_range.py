@@ -36,22 +36,27 @@ class KnownInputs:
     Attributes:
         prototypes: Representatives, compressed, float32, shape ``(P, I)``.
         scale: In the unit of the input, positive.
-        distance_max: No training row is farther from its nearest representative.
+        distance_max: From here on an input is unlike all training rows.
+        metric: Distances are of compressed rows times this matrix, float32, shape ``(I, I)``, which
+            stretches directions in which the training rows hardly vary; None = they are plain.
     """
 
     prototypes: FloatArray
     scale: float
     distance_max: float
+    metric: FloatArray | None = None
 
 
 def known_inputs_to_bytes(known: KnownInputs) -> bytes:
     """The file ``range.npz``."""
     buffer = io.BytesIO()
+    metric = {} if known.metric is None else {"metric": known.metric}
     np.savez_compressed(
         buffer,
         prototypes=known.prototypes,
         scale=np.float64(known.scale),
         distance_max=np.float64(known.distance_max),
+        **metric,
     )
     return buffer.getvalue()
 
@@ -65,7 +70,10 @@ def known_inputs_from_bytes(data: bytes, width: int, where: str) -> KnownInputs:
     try:
         arrays = arrays_of_npz(data, RANGE_BYTES_MAX)
         found = KnownInputs(
-            arrays["prototypes"], float(arrays["scale"]), float(arrays["distance_max"])
+            arrays["prototypes"],
+            float(arrays["scale"]),
+            float(arrays["distance_max"]),
+            arrays.get("metric"),
         )
         problem = _problem(found, width)
     except (ValueError, KeyError, TypeError) as error:
@@ -85,6 +93,12 @@ def _problem(known: KnownInputs, width: int) -> str:
         return f"{len(prototypes)} prototypes of {width} values are not at most {PROTOTYPES_MAX}"
     if not np.isfinite(prototypes).all():
         return "prototypes hold NaN or infinity"
+    metric = known.metric
+    if metric is not None:
+        if metric.dtype != np.float32 or metric.shape != (width, width):
+            return f"metric is {metric.dtype}{list(metric.shape)}, not float32[{width}, {width}]"
+        if not np.isfinite(metric).all():
+            return "metric holds NaN or infinity"
     for name, value in (("scale", known.scale), ("distance_max", known.distance_max)):
         if not (math.isfinite(value) and value > 0):
             return f"{name} is {value}, not a positive number"

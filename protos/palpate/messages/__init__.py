@@ -5,6 +5,7 @@ are not copied on construction and must not be written to afterwards. The codec 
 """
 
 from palpate.messages.estimates import (
+    ErrorBounds,
     FeatureEstimate,
     FieldEstimate,
     QualityFlag,
@@ -92,6 +93,7 @@ __all__ = [
     "CountArray",
     "DoubleArray",
     "ElectrodeFrame",
+    "ErrorBounds",
     "ErrorReply",
     "FaultKind",
     "FeatureEstimate",

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from math import hypot
 
 from palpate.messages.frames import FieldFrame, FloatArray, Stamp
 
@@ -85,6 +86,32 @@ class QualityFlag(IntEnum):
     """The bundle was not made for this sensor: its serial number is not among the bundle's."""
 
 
+@dataclass(frozen=True, slots=True)
+class ErrorBounds:
+    """How far an estimate may be off: bounds of its errors (docs/adr/0031-intervals.md).
+
+    Without a quality flag each holds in ``level`` of the presses like those it was calibrated on;
+    with one it is a hint.
+
+    Attributes:
+        level: Share of the errors within a bound, on presses that no training saw.
+        force_magnitude: Of the length of the force [N].
+        force: Of the force [N]: the length of the error's vector.
+        contact_location: Of the contact location [m], a distance; None without contact, and where
+            it is not known.
+        displacement: Of a field [m]: the error of a node's displacement, mean over all nodes.
+        other_sensors: The bundle was not made for this sensor; the bounds are what real fingers
+            needed that it was not made for either.
+    """
+
+    level: float
+    force_magnitude: float | None = None
+    force: float | None = None
+    contact_location: float | None = None
+    displacement: float | None = None
+    other_sensors: bool = False
+
+
 UNIT_TOLERANCE = 1e-3
 """How much the length of a contact normal may differ from one."""
 
@@ -107,6 +134,7 @@ class FeatureEstimate:
         contact_normal: Unit vector out of the skin where it is touched, shape ``(3,)``; None
             likewise.
         contact_normal_sd: One standard deviation of its angle [rad]; None likewise.
+        bounds: How far it may be off; None where the bundle cannot say.
     """
 
     source: Stamp
@@ -125,6 +153,15 @@ class FeatureEstimate:
     centre_of_pressure_sd: FloatArray | None = None
     contact_normal: FloatArray | None = None
     contact_normal_sd: float | None = None
+    bounds: ErrorBounds | None = None
+
+    @property
+    def force_interval(self) -> tuple[float, float] | None:
+        """Ends between which the length of the true force lies [N], by ``bounds``."""
+        if self.bounds is None or self.bounds.force_magnitude is None:
+            return None
+        length, half = hypot(*self.force.tolist()), self.bounds.force_magnitude
+        return max(0.0, length - half), length + half
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +180,7 @@ class FieldEstimate:
         coefficients: The same displacement in the bundle's basis [m], shape ``(K,)``, or None:
             see ``ModeBasis``.
         basis_sha256: Content hash of that basis, 32 bytes; empty without coefficients.
+        bounds: How far it may be off; None where the bundle cannot say.
     """
 
     source: Stamp
@@ -158,6 +196,7 @@ class FieldEstimate:
     bundle_version: int = 0
     coefficients: FloatArray | None = None
     basis_sha256: bytes = b""
+    bounds: ErrorBounds | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,24 @@ QUALITY_FLAG_EXTRAPOLATING: QualityFlag
 QUALITY_FLAG_RANGE_UNKNOWN: QualityFlag
 QUALITY_FLAG_UNCALIBRATED: QualityFlag
 
+class ErrorBounds(_message.Message):
+    __slots__ = ("level", "force_magnitude", "force", "contact_location", "displacement", "other_sensors")
+    LEVEL_FIELD_NUMBER: _ClassVar[int]
+    FORCE_MAGNITUDE_FIELD_NUMBER: _ClassVar[int]
+    FORCE_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_LOCATION_FIELD_NUMBER: _ClassVar[int]
+    DISPLACEMENT_FIELD_NUMBER: _ClassVar[int]
+    OTHER_SENSORS_FIELD_NUMBER: _ClassVar[int]
+    level: float
+    force_magnitude: float
+    force: float
+    contact_location: float
+    displacement: float
+    other_sensors: bool
+    def __init__(self, level: _Optional[float] = ..., force_magnitude: _Optional[float] = ..., force: _Optional[float] = ..., contact_location: _Optional[float] = ..., displacement: _Optional[float] = ..., other_sensors: _Optional[bool] = ...) -> None: ...
+
 class FeatureEstimate(_message.Message):
-    __slots__ = ("source", "sensor_serial", "bundle_sha256", "tare_id", "in_contact", "force", "force_sd", "contact_location", "contact_location_sd", "quality", "bundle_name", "bundle_version", "centre_of_pressure", "centre_of_pressure_sd", "contact_normal", "contact_normal_sd")
+    __slots__ = ("source", "sensor_serial", "bundle_sha256", "tare_id", "in_contact", "force", "force_sd", "contact_location", "contact_location_sd", "quality", "bundle_name", "bundle_version", "centre_of_pressure", "centre_of_pressure_sd", "contact_normal", "contact_normal_sd", "bounds")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     SENSOR_SERIAL_FIELD_NUMBER: _ClassVar[int]
     BUNDLE_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -45,6 +61,7 @@ class FeatureEstimate(_message.Message):
     CENTRE_OF_PRESSURE_SD_FIELD_NUMBER: _ClassVar[int]
     CONTACT_NORMAL_FIELD_NUMBER: _ClassVar[int]
     CONTACT_NORMAL_SD_FIELD_NUMBER: _ClassVar[int]
+    BOUNDS_FIELD_NUMBER: _ClassVar[int]
     source: _common_pb2.Stamp
     sensor_serial: str
     bundle_sha256: bytes
@@ -61,10 +78,11 @@ class FeatureEstimate(_message.Message):
     centre_of_pressure_sd: _common_pb2.Vector3
     contact_normal: _common_pb2.Vector3
     contact_normal_sd: float
-    def __init__(self, source: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., tare_id: _Optional[int] = ..., in_contact: _Optional[bool] = ..., force: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., force_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_location: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_location_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., quality: _Optional[_Iterable[_Union[QualityFlag, str]]] = ..., bundle_name: _Optional[str] = ..., bundle_version: _Optional[int] = ..., centre_of_pressure: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., centre_of_pressure_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_normal: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_normal_sd: _Optional[float] = ...) -> None: ...
+    bounds: ErrorBounds
+    def __init__(self, source: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., tare_id: _Optional[int] = ..., in_contact: _Optional[bool] = ..., force: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., force_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_location: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_location_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., quality: _Optional[_Iterable[_Union[QualityFlag, str]]] = ..., bundle_name: _Optional[str] = ..., bundle_version: _Optional[int] = ..., centre_of_pressure: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., centre_of_pressure_sd: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_normal: _Optional[_Union[_common_pb2.Vector3, _Mapping]] = ..., contact_normal_sd: _Optional[float] = ..., bounds: _Optional[_Union[ErrorBounds, _Mapping]] = ...) -> None: ...
 
 class FieldEstimate(_message.Message):
-    __slots__ = ("source", "sensor_serial", "bundle_sha256", "tare_id", "mesh_sha256", "displacement", "displacement_sd", "contact_force", "quality", "bundle_name", "bundle_version", "coefficients", "basis_sha256")
+    __slots__ = ("source", "sensor_serial", "bundle_sha256", "tare_id", "mesh_sha256", "displacement", "displacement_sd", "contact_force", "quality", "bundle_name", "bundle_version", "coefficients", "basis_sha256", "bounds")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     SENSOR_SERIAL_FIELD_NUMBER: _ClassVar[int]
     BUNDLE_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -78,6 +96,7 @@ class FieldEstimate(_message.Message):
     BUNDLE_VERSION_FIELD_NUMBER: _ClassVar[int]
     COEFFICIENTS_FIELD_NUMBER: _ClassVar[int]
     BASIS_SHA256_FIELD_NUMBER: _ClassVar[int]
+    BOUNDS_FIELD_NUMBER: _ClassVar[int]
     source: _common_pb2.Stamp
     sensor_serial: str
     bundle_sha256: bytes
@@ -91,7 +110,8 @@ class FieldEstimate(_message.Message):
     bundle_version: int
     coefficients: _containers.RepeatedScalarFieldContainer[float]
     basis_sha256: bytes
-    def __init__(self, source: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., tare_id: _Optional[int] = ..., mesh_sha256: _Optional[bytes] = ..., displacement: _Optional[_Iterable[float]] = ..., displacement_sd: _Optional[_Iterable[float]] = ..., contact_force: _Optional[_Iterable[float]] = ..., quality: _Optional[_Iterable[_Union[QualityFlag, str]]] = ..., bundle_name: _Optional[str] = ..., bundle_version: _Optional[int] = ..., coefficients: _Optional[_Iterable[float]] = ..., basis_sha256: _Optional[bytes] = ...) -> None: ...
+    bounds: ErrorBounds
+    def __init__(self, source: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., bundle_sha256: _Optional[bytes] = ..., tare_id: _Optional[int] = ..., mesh_sha256: _Optional[bytes] = ..., displacement: _Optional[_Iterable[float]] = ..., displacement_sd: _Optional[_Iterable[float]] = ..., contact_force: _Optional[_Iterable[float]] = ..., quality: _Optional[_Iterable[_Union[QualityFlag, str]]] = ..., bundle_name: _Optional[str] = ..., bundle_version: _Optional[int] = ..., coefficients: _Optional[_Iterable[float]] = ..., basis_sha256: _Optional[bytes] = ..., bounds: _Optional[_Union[ErrorBounds, _Mapping]] = ...) -> None: ...
 
 class SynthesisEstimate(_message.Message):
     __slots__ = ("source", "sensor_serial", "bundle_sha256", "mesh_sha256", "tared_counts", "tared_counts_sd", "quality", "bundle_name", "bundle_version")

@@ -36,7 +36,7 @@ from palpate.messages import (
     as_field_frame,
 )
 from palpate_services.config import ElectrodesConfig, EstimatingConfig
-from palpate_services.inference.model import Outputs, Runtime
+from palpate_services.inference.model import Outputs, Place, Runtime
 
 M = TypeVar("M")
 E = TypeVar("E")
@@ -205,10 +205,15 @@ def sample_of_field(
 
 
 def _quality(
-    sample: Sample, outputs: Outputs, runtime: Runtime, *, without: Collection[str] = ()
+    sample: Sample,
+    outputs: Outputs,
+    runtime: Runtime,
+    *,
+    without: Collection[str] = (),
+    place: Place | None = None,
 ) -> tuple[QualityFlag, ...]:
     """All flags of an estimate, in ascending order, each once."""
-    found = runtime.range.flags(sample.values, outputs, without=without)
+    found = runtime.range.flags(sample.values, outputs, without=without, place=place)
     if not sample.quality:
         return found
     return tuple(sorted({*sample.quality, *found}))
@@ -222,7 +227,9 @@ def features_of(
     normal = outputs.get("contact_normal")
     # In doubles and without NumPy: three values are faster so, and the threshold is a double.
     x, y, z = force.tolist()
-    in_contact = sqrt(x * x + y * y + z * z) >= runtime.contact_threshold_n
+    size = sqrt(x * x + y * y + z * z)
+    in_contact = size >= runtime.contact_threshold_n
+    place = runtime.range.place(sample.values)
     return FeatureEstimate(
         source=frame.stamp,
         sensor_serial=frame.sensor_serial,
@@ -233,7 +240,9 @@ def features_of(
         force_sd=outputs["force_sd"],
         contact_location=outputs.get("contact_location") if in_contact else None,
         contact_location_sd=outputs.get("contact_location_sd") if in_contact else None,
-        quality=_quality(sample, outputs, runtime, without=() if in_contact else _OF_CONTACT),
+        quality=_quality(
+            sample, outputs, runtime, without=() if in_contact else _OF_CONTACT, place=place
+        ),
         bundle_name=runtime.name,
         bundle_version=runtime.version,
         centre_of_pressure=outputs.get("centre_of_pressure") if in_contact else None,
@@ -242,6 +251,12 @@ def features_of(
         contact_normal_sd=float(outputs["contact_normal_sd"][0])
         if in_contact and normal is not None
         else None,
+        bounds=runtime.bounds(
+            size,
+            place,
+            others=QualityFlag.UNCALIBRATED in sample.quality,
+            contact=in_contact and "contact_location" in outputs,
+        ),
     )
 
 
@@ -261,6 +276,9 @@ def field_of(
 ) -> FieldEstimate:
     """The field of a frame, from its sample and what the model made of it."""
     force = outputs.get("contact_force")
+    place = runtime.range.place(sample.values)
+    coefficients = outputs.get("coefficients")
+    size_mm = 0.0 if coefficients is None else 1e3 * sqrt(float(coefficients @ coefficients))
     return FieldEstimate(
         source=frame.stamp,
         sensor_serial=frame.sensor_serial,
@@ -270,11 +288,12 @@ def field_of(
         displacement=outputs["displacement"].reshape(-1, 3),
         displacement_sd=outputs.get("displacement_sd"),
         contact_force=None if force is None else force.reshape(-1, 3),
-        quality=_quality(sample, outputs, runtime),
+        quality=_quality(sample, outputs, runtime, place=place),
         bundle_name=runtime.name,
         bundle_version=runtime.version,
-        coefficients=outputs.get("coefficients"),
+        coefficients=coefficients,
         basis_sha256=b"" if runtime.basis is None else runtime.basis.sha256,
+        bounds=runtime.bounds(size_mm, place, others=QualityFlag.UNCALIBRATED in sample.quality),
     )
 
 

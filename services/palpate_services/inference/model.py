@@ -9,18 +9,20 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Collection, Mapping, Sequence
-from math import asinh, hypot, isfinite
+from math import asinh, hypot, isfinite, sqrt
 from operator import gt, lt
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import BundleError
 from palpate.files.bundle import Bundle, Manifest
+from palpate.files.intervals import bound_terms, bounds_of
 from palpate.files.training_range import KnownInputs
 from palpate.messages import (
+    ErrorBounds,
     FloatArray,
     ModelMetadata,
     QualityFlag,
@@ -55,8 +57,17 @@ class RangeCheck:
         """The check of a bundle; of one that does not know its range, one that says so."""
         return cls(bundle.manifest.training_range, bundle.known_inputs)
 
+    def place(self, sample: FloatArray) -> Place | None:
+        """Where an input lies among those of the training; None where these are not known."""
+        return None if self._combinations is None else self._combinations.place(sample)
+
     def flags(
-        self, sample: FloatArray, outputs: Mapping[str, FloatArray], *, without: Collection[str]
+        self,
+        sample: FloatArray,
+        outputs: Mapping[str, FloatArray],
+        *,
+        without: Collection[str],
+        place: Place | None = None,
     ) -> tuple[QualityFlag, ...]:
         """What is to be said of an estimate.
 
@@ -64,14 +75,15 @@ class RangeCheck:
             sample: What the model got, flat.
             outputs: What it made of it, by name.
             without: Outputs that are not part of the estimate.
+            place: Of the sample, where it was asked for already.
         """
         if self._known is None:
             return (QualityFlag.RANGE_UNKNOWN,)
-        unlike = beyond = False
+        place = place or self.place(sample)
+        unlike = place is not None and place.distance > 1.0
+        beyond = False
         for ends in self._inputs:
             unlike = unlike or ends.exceeded(sample)
-        if self._combinations is not None and not unlike:
-            unlike = self._combinations.unknown(sample)
         for name, ends in self._outputs:
             beyond = beyond or (name not in without and ends.exceeded(outputs[name]))
         return _FLAGS[unlike, beyond]
@@ -121,30 +133,40 @@ class _Ends:
         return bool(np.einsum("ij,ij->i", vectors, vectors).max() > self._squared_max)
 
 
+class Place(NamedTuple):
+    """Where an input lies among those of the training.
+
+    Attributes:
+        distance: From the nearest of their representatives, over the limit: above one it is unlike
+            all of them.
+        common: Common mode: mean of the compressed values.
+    """
+
+    distance: float
+    common: float
+
+
 class _Combinations:
     """Which values occur together: the distance from the nearest representative."""
 
     def __init__(self, known: KnownInputs) -> None:
         self._scale = float(known.scale)
-        self._prototypes = np.ascontiguousarray(known.prototypes)
+        self._metric = None if known.metric is None else known.metric.astype(np.float64)
+        prototypes = known.prototypes.astype(np.float64)
+        if self._metric is not None:
+            prototypes = prototypes @ self._metric
         # |q - p|^2 = |q|^2 + (|p|^2 - 2 q.p): what does not depend on q is computed once.
-        self._squared = np.einsum("ij,ij->i", known.prototypes, known.prototypes)
-        self._limit = float(known.distance_max**2)
-        # Where to look first: what is near one sample is near the next one of its stream.
-        self._near: list[float] = self._prototypes[0].tolist()
+        self._squared = np.einsum("ij,ij->i", prototypes, prototypes)
+        self._minus_twice = np.ascontiguousarray(-2.0 * prototypes)
+        self._limit = float(known.distance_max)
 
-    def unknown(self, sample: FloatArray) -> bool:
+    def place(self, sample: FloatArray) -> Place:
         compressed = [asinh(value / self._scale) for value in sample.tolist()]
-        if _squared_distance(compressed, self._near) <= self._limit:
-            return False
-        apart = self._squared - 2.0 * (self._prototypes @ np.array(compressed, np.float32))
-        self._near = near = self._prototypes[int(apart.argmin())].tolist()
-        return _squared_distance(compressed, near) > self._limit
-
-
-def _squared_distance(one: Sequence[float], other: Sequence[float]) -> float:
-    """In plain Python, which is faster for so few numbers."""
-    return sum((a - b) * (a - b) for a, b in zip(one, other, strict=True))
+        where = np.array(compressed)
+        if self._metric is not None:
+            where = where @ self._metric
+        nearest = float((self._minus_twice @ where + self._squared).min()) + float(where @ where)
+        return Place(sqrt(max(nearest, 0.0)) / self._limit, sum(compressed) / len(compressed))
 
 
 _log = logging.getLogger(__name__)
@@ -215,6 +237,7 @@ class Runtime:
         self.mesh = bundle.mesh
         self.mesh_sha256 = b"" if bundle.mesh is None else bundle.mesh.sha256
         self.range = RangeCheck.of(bundle)
+        self._intervals = manifest.intervals
         self._made_for: dict[str, bool] = {}
         self._lock = threading.Lock()
         self.name, self.version = manifest.name, manifest.version
@@ -247,6 +270,22 @@ class Runtime:
                 self._made_for.clear()
             self._made_for[serial] = found
         return found
+
+    def bounds(
+        self, size: float, place: Place | None, *, others: bool, contact: bool = True
+    ) -> ErrorBounds | None:
+        """How far an estimate may be off; None where the bundle cannot say.
+
+        Args:
+            size: Of the estimate: length of the force [N], or of a field's coefficients [mm].
+            place: Of its input.
+            others: The sensor is none that the bundle was made for.
+            contact: Whether the estimate has a contact location.
+        """
+        if self._intervals is None or place is None:
+            return None
+        terms = bound_terms(size, place.common, place.distance)
+        return bounds_of(self._intervals, terms, others=others, contact=contact)
 
     def run(self, sample: FloatArray) -> Outputs | None:
         """Run the model on one sample.

@@ -391,6 +391,31 @@ def train_upgrade(
     console.print(f"wrote {out}, digest {digest.hex()}")
 
 
+def train_intervals(
+    bundle: Annotated[Path, typer.Argument(help="Folder of a features or field bundle.")],
+    data: Annotated[
+        Path,
+        typer.Argument(help="Presses that no training has seen: features (.h5); of fields mixed."),
+    ],
+    out: Bundle,
+    other: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Recording (.h5) of a sensor that the bundle was not made for; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """A bundle with bounds of its errors, from presses held out; weights and answers stay.
+
+    palpate train intervals models/features-twin/7 held-out.h5 models/features-twin/8
+    """
+    from palpate_training.tasks.intervals import add_intervals
+
+    digest = add_intervals(bundle, data, out, others=other or ())
+    console.print(f"wrote {out}, digest {digest.hex()}")
+
+
 def _bundle(
     train: Callable[..., dict[str, float]],
     task: str,

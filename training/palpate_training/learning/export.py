@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from palpate import __version__
 from palpate.errors import BundleError, MissingExtraError
 from palpate.files.bundle import FieldMesh, Manifest, write_bundle
+from palpate.files.intervals import Intervals
 from palpate.files.tasks import TASKS, tensors_of
 from palpate.files.training_range import KnownInputs
 from palpate.messages import SensorType, TensorInfo, TrainingRange
@@ -192,6 +193,7 @@ def _export(
     training_range: TrainingRange | None = None,
     known_inputs: KnownInputs | None = None,
     sensor_serials: tuple[str, ...] = (),
+    intervals: Intervals | None = None,
 ) -> bytes:
     """Export, compare, write."""
     names = [tensor.name for tensor in gives]
@@ -219,6 +221,7 @@ def _export(
         normalisation=dict(normalisation or {}),
         training_range=training_range,
         sensor_serials=sensor_serials,
+        intervals=intervals,
         basis=basis_of(model, dict(zip(names, gives, strict=True))),
     )
     golden = {input_name: golden_inputs} | dict(zip(names, answers, strict=True))
@@ -379,7 +382,7 @@ def frame_s(model: bytes, input_name: str, frame: FloatArray, frames: int = 500)
     Raises:
         MissingExtraError: onnxruntime is not installed.
     """
-    session = _session(model)
+    session = session_of(model)
     taken = []
     for _ in range(frames):
         begun = time.perf_counter()
@@ -398,7 +401,7 @@ def run_onnx(
         MissingExtraError: onnxruntime is not installed.
     """
     try:
-        session = _session(model)
+        session = session_of(model)
         together = session.run(None, {input_name: inputs})
         single = [session.run(None, {input_name: inputs[i : i + 1]}) for i in range(len(inputs))]
     except MissingExtraError:
@@ -411,7 +414,7 @@ def run_onnx(
     return together, [np.concatenate(parts) for parts in zip(*single, strict=True)]
 
 
-def _session(model: bytes) -> Any:
+def session_of(model: bytes) -> Any:
     """A model in ONNX Runtime, on one thread."""
     runtime = require("onnxruntime", extra="training")
     options = runtime.SessionOptions()

@@ -26,6 +26,10 @@ untouched finger drifts and is noisy by about as much."""
 ACCEPTED = 0.98
 """Share of the rows of presses held out that shall lie within the limit."""
 
+SHRINK = 3.0
+"""Variance added to that of every direction before it is divided by its root [compressed counts^2]:
+chosen on each of two real fingers for the other, which agree (docs/results/quality.md)."""
+
 _FOLDS = 5
 
 
@@ -59,34 +63,65 @@ def known_inputs(
     representatives, and no training row lies beyond it.
     """
     compressed = np.arcsinh(rows / np.float32(scale)).astype(np.float32)
-    every, radius = _spread(compressed, most)
+    every = _spread(compressed, most)
+    metric = metric_of(every)
+    radius = float(_nearest(compressed @ metric, every @ metric).max())
     names = np.unique(groups)
     parts = np.array_split(np.random.default_rng(0).permutation(names), min(_FOLDS, len(names)))
     held = [np.isin(groups, part) for part in parts if len(parts) > 1]
-    distances = [_nearest(compressed[out], _spread(compressed[~out], most)[0]) for out in held]
+    distances = [
+        _nearest(compressed[out] @ metric, _spread(compressed[~out], most) @ metric) for out in held
+    ]
     unseen = float(np.quantile(np.concatenate(distances), ACCEPTED)) if distances else 0.0
     # A handful of rows may all be representatives of their own; noise must still be let through.
-    return KnownInputs(every, scale, max(1.001 * radius, unseen, 1e-3))
+    return KnownInputs(every, scale, max(1.001 * radius, unseen, 1e-3), metric)
 
 
-def _spread(rows: FloatArray, most: int) -> tuple[FloatArray, float]:
-    """Representatives of rows, and the largest distance of any row from its nearest."""
+def metric_of(representatives: FloatArray, shrink: float = SHRINK) -> FloatArray:
+    """The matrix that makes directions count more in which representatives ``(P, I)`` vary less.
+
+    A press moves the electrodes together, in few ways; what is not one of these ways is odd long
+    before it is large.
+    """
+    centred = representatives.astype(np.float64) - representatives.mean(axis=0)
+    variance, directions = np.linalg.eigh(centred.T @ centred / len(centred))
+    scaled = directions / np.sqrt(np.maximum(variance, 0.0) + shrink)
+    return np.asarray(scaled @ directions.T, np.float32)
+
+
+def places_of(
+    known: KnownInputs, rows: npt.NDArray[np.floating]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Where rows ``(N, I)`` lie, as a service finds it.
+
+    Returns:
+        Distance of each from the nearest representative, over the limit; and its common mode.
+    """
+    compressed = np.arcsinh(rows.astype(np.float64) / known.scale)
+    metric = np.eye(rows.shape[1]) if known.metric is None else known.metric.astype(np.float64)
+    distance = _nearest(compressed @ metric, known.prototypes.astype(np.float64) @ metric)
+    return distance / known.distance_max, compressed.mean(axis=1)
+
+
+def _spread(rows: FloatArray, most: int) -> FloatArray:
+    """Representatives of rows."""
     norms = np.einsum("ij,ij->i", rows, rows)
     chosen = [int(np.argmax(norms))]
     squared = _squared_distance(rows, norms, chosen[0])
     for _ in range(min(most, len(rows)) - 1):
         chosen.append(int(np.argmax(squared)))
         squared = np.minimum(squared, _squared_distance(rows, norms, chosen[-1]))
-    return rows[chosen], float(np.sqrt(max(float(squared.max()), 0.0)))
+    return rows[chosen]
 
 
-def _nearest(rows: FloatArray, representatives: FloatArray) -> npt.NDArray[np.floating]:
+def _nearest(
+    rows: npt.NDArray[np.floating], representatives: npt.NDArray[np.floating]
+) -> npt.NDArray[np.float64]:
     """Distance of each row from its nearest representative, shape ``(N,)``."""
     own = np.einsum("ij,ij->i", rows, rows)
     theirs = np.einsum("ij,ij->i", representatives, representatives)
     squared = theirs - 2.0 * (rows @ representatives.T)
-    distances: npt.NDArray[np.floating] = np.sqrt(np.maximum(squared.min(axis=1) + own, 0.0))
-    return distances
+    return np.sqrt(np.maximum(squared.min(axis=1) + own, 0.0)).astype(np.float64)
 
 
 def _squared_distance(rows: FloatArray, norms: FloatArray, at: int) -> FloatArray:

@@ -17,6 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
+from palpate.files.intervals import Intervals
+from palpate.files.training_range import KnownInputs
 from palpate.messages import TrainingRange
 from palpate_training.datasets.features import (
     OF_CONTACT,
@@ -35,6 +37,7 @@ from palpate_training.learning.features_net import (
     score_of,
 )
 from palpate_training.learning.graphs import FeaturesGraph
+from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
 from palpate_training.learning.metrics import (
     angles,
     cluster_bootstrap,
@@ -45,7 +48,7 @@ from palpate_training.learning.metrics import (
     rms,
 )
 from palpate_training.learning.networks import predict, round_to_half
-from palpate_training.learning.ranges import ends_of, known_inputs
+from palpate_training.learning.ranges import ends_of, known_inputs, places_of
 from palpate_training.learning.splits import Rows, RowSplit, by_group
 
 _log = logging.getLogger(__name__)
@@ -173,6 +176,7 @@ def train_features(
             data.group,
         )
 
+    seen = known_inputs(x[split.train], data.group[split.train])
     force_sd = _residual_sd(validated[:, :3], data.force[split.validation])
     graph = FeaturesGraph(net, force_sd, contact_sd)
     digest = export_features(
@@ -200,8 +204,9 @@ def train_features(
         },
         seed=seed,
         training_range=features_range(data, split.train),
-        known_inputs=known_inputs(x[split.train], data.group[split.train]),
+        known_inputs=seen,
         sensor_serials=tuple(serials),
+        intervals=_intervals(data, tested, split.test, threshold, seen),
     )
     return FeaturesReport(
         digest, metrics, (len(split.train), len(split.validation), len(split.test))
@@ -222,6 +227,40 @@ def features_range(data: FeatureDataset, rows: Rows) -> TrainingRange:
         inputs=(ends_of("electrodes", "tared counts", data.tared_counts[rows]),),
         outputs=tuple(outputs),
         combinations=True,
+    )
+
+
+def _intervals(
+    data: FeatureDataset, estimate: FloatArray, rows: Rows, threshold: float, seen: KnownInputs
+) -> Intervals:
+    """Bounds of the errors, of the tested presses.
+
+    Args:
+        data: All rows.
+        estimate: Of the tested rows: force, then what only a contact has, as it is trained.
+        rows: The tested rows.
+        threshold: Force from which there is contact [N].
+        seen: Representatives of the training rows.
+    """
+    touching = np.ones(len(rows), bool) if data.in_contact is None else data.in_contact[rows]
+    kept, estimate = rows[touching], estimate[touching]
+    size = np.linalg.norm(estimate[:, :3].astype(np.float64), axis=1)
+    found = force_errors(estimate[:, :3], data.force[kept])
+    errors = {"force_magnitude": found["magnitude_n"], "force": found["vector_n"]}
+    for number, (quantity, wanted, _) in enumerate(_of_contact(data), start=1):
+        if quantity == "contact_location":
+            part = estimate[:, 3 * number : 3 * number + 3]
+            distance = location_errors(part, wanted[kept])["distance_m"]
+            errors[quantity] = np.where(size >= threshold, distance, np.nan)
+    distance, common = places_of(seen, data.tared_counts[kept])
+    press = data.group[kept]
+    return Intervals(
+        LEVEL,
+        f"{len(kept)} rows of {len(np.unique(press))} presses that training has not seen, of"
+        f" {data.provenance.source}",
+        data.content_sha256(),
+        len(np.unique(press)),
+        fit_formulas(errors, terms_of(size, common, distance), press),
     )
 
 

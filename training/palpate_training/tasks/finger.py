@@ -17,6 +17,7 @@ import torch
 from torch import nn
 
 from palpate.errors import DatasetError
+from palpate.files.intervals import BoundFormula, Intervals
 from palpate.messages import TrainingRange
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.learning.export import export_features, refuse_existing
@@ -27,6 +28,7 @@ from palpate_training.learning.force_process import (
     KnownRows,
 )
 from palpate_training.learning.graphs import FeaturesGraph
+from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
 from palpate_training.learning.metrics import force_errors, force_metrics
 from palpate_training.learning.ranges import ends_of, known_inputs
 from palpate_training.tasks.features import threshold_above
@@ -52,10 +54,9 @@ FOLDS = 6
 CHOICES = 3
 """Those that are left, in so many parts to choose on."""
 
-LEVEL = 0.9
-"""Share of errors that 1.645 standard deviations shall hold, as of a normal distribution."""
-
 _DEVIATIONS = 1.6449
+"""``LEVEL`` of the errors shall lie within so many standard deviations, as of a normal
+distribution."""
 
 _THRESHOLD_UNKNOWN_N = 0.2
 """Where no row is untouched: above the noise of a six-axis sensor [N]."""
@@ -143,6 +144,7 @@ def train_finger(
         for key in ("force_magnitude_median_n", "force_angle_median_rad"):
             metrics[f"{other}_{key}"] = found[key]
     presses = len(np.unique(known.press[touched]))
+    source = f"{len(known)} rows of {data.provenance.source}"
     digest = export_features(
         folder,
         FeaturesGraph(net, force_sd.astype(np.float32)),
@@ -159,7 +161,7 @@ def train_finger(
             f" {_DEVIATIONS:.3f} of it",
         },
         training_range=TrainingRange(
-            source=f"{len(known)} rows of {data.provenance.source}",
+            source=source,
             data_sha256=data.content_sha256(),
             rows=len(known),
             inputs=(ends_of("electrodes", "tared counts", known.tared),),
@@ -168,12 +170,48 @@ def train_finger(
         ),
         known_inputs=known_inputs(known.tared.astype(np.float32), known.press),
         sensor_serials=tuple(serials),
+        intervals=Intervals(
+            LEVEL,
+            f"{source}, each press held out in its turn",
+            data.content_sha256(),
+            presses,
+            finger_formulas(held_out[touched], known.force[touched], known.press[touched]),
+        ),
     )
     return FingerReport(digest, estimator, metrics, presses, len(known))
 
 
 STEPS = FOLDS + 1
 """How often ``train_finger`` calls ``on_step``."""
+
+
+def finger_formulas(held_out: Floats, force: Floats, press: Rows) -> tuple[BoundFormula, ...]:
+    """Bounds of the errors of the next press.
+
+    Args:
+        held_out: Forces estimated without the press that is estimated [N], shape ``(N, 3)``.
+        force: The true ones.
+        press: Press of each row, shape ``(N,)``.
+    """
+    found = force_errors(held_out, force)
+    size = np.linalg.norm(held_out, axis=1)
+    # Its own rows are its training range: they say nothing of how errors grow away from it.
+    nothing = np.zeros(len(size))
+    return fit_formulas(
+        {"force_magnitude": found["magnitude_n"], "force": found["vector_n"]},
+        terms_of(size, nothing, nothing),
+        press,
+        level=LEVEL,
+        use=OF_FINGER if len(np.unique(press)) >= PRESSES_SLOPE else OF_FEW,
+    )
+
+
+OF_FINGER = (True, True, False, False, False)
+OF_FEW = (True, False, False, False, False)
+"""Terms of a finger's bounds, and those of a few presses."""
+
+PRESSES_SLOPE = 15
+"""From so many presses on errors may grow with the force."""
 
 
 def known_rows(data: FeatureDataset) -> tuple[KnownRows, npt.NDArray[np.bool_]]:

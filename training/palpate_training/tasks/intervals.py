@@ -1,0 +1,228 @@
+"""A bundle with bounds of its errors, from presses that its training has not seen.
+
+The weights stay what they are, so do its answers and its metrics. The held-out presses also say
+from where on an input is unlike the training rows; nothing is learned from them but these two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import BundleError, DatasetError
+from palpate.files.bundle import Bundle, read_bundle, write_bundle
+from palpate.files.intervals import BoundFormula, Intervals
+from palpate.files.training_range import KnownInputs
+from palpate_training.datasets.experiment import MixedDataset, content_sha256, read_mixed
+from palpate_training.datasets.features import FeatureDataset, FloatArray, open_dataset
+from palpate_training.learning.export import refuse_existing, session_of
+from palpate_training.learning.intervals import (
+    LEVEL,
+    fit_formulas,
+    press_quantile,
+    terms_of,
+)
+from palpate_training.learning.metrics import field_errors, force_errors, location_errors
+from palpate_training.learning.ranges import metric_of, places_of
+from palpate_training.tasks.fields import tared_counts
+
+Floats = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.integer]
+
+UNLIKE = 0.005
+"""Share of the rows of held-out presses that may be flagged as unlike the training rows by their
+distance; ends of single values flag some more."""
+
+PRESSES_LEAST = 20
+"""Of fewer presses nine tenths are not known well enough to be shipped with a bundle."""
+
+OF_OTHERS = (True, True, False, False, False)
+"""Terms of bounds for sensors that a bundle was not made for: two fingers cannot teach more."""
+
+_ROWS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """What a bundle makes of presses that its training has not seen.
+
+    Attributes:
+        errors: Of every row by the name of its bound, shape ``(N,)``; NaN where there is none.
+        size: Of the estimate, as ``bound_terms`` takes it, shape ``(N,)``.
+        tared: The bundle's inputs [counts], shape ``(N, 19)``.
+        force_n: Length of the true force [N], shape ``(N,)``.
+        press: Press of every row, one number over all specimens, shape ``(N,)``.
+    """
+
+    errors: Mapping[str, Floats]
+    size: Floats
+    tared: FloatArray
+    force_n: Floats
+    press: Labels
+
+    def terms(self, known: KnownInputs) -> Floats:
+        """Terms of the bounds, with distances from these representatives."""
+        distance, common = places_of(known, self.tared)
+        return terms_of(self.size, common, distance)
+
+
+def held_out_features(bundle: Bundle, data: FeatureDataset) -> HeldOut:
+    """Errors of the rows in contact; where contact is not known, of all rows.
+
+    A recording that is a single group is told apart by its blocks.
+    """
+    rows = np.arange(len(data)) if data.in_contact is None else np.flatnonzero(data.in_contact)
+    tared, truth = data.tared_counts[rows], data.force[rows]
+    answers = _answers(bundle, tared)
+    force = answers["force"]
+    found = force_errors(force, truth)
+    size = np.linalg.norm(force.astype(np.float64), axis=1)
+    errors = {"force_magnitude": found["magnitude_n"], "force": found["vector_n"]}
+    if data.contact_location is not None and "contact_location" in answers:
+        wanted = data.contact_location[rows]
+        distance = location_errors(answers["contact_location"], wanted)["distance_m"]
+        # Below its threshold a bundle gives no location.
+        given = size >= bundle.manifest.contact_threshold_n
+        errors["contact_location"] = np.where(given, distance, np.nan)
+    press = data.group if len(np.unique(data.group)) > 1 else data.block
+    return HeldOut(
+        errors, size, tared, np.linalg.norm(truth.astype(np.float64), axis=1), press[rows]
+    )
+
+
+def held_out_fields(bundle: Bundle, data: MixedDataset) -> HeldOut:
+    """Errors of the fields of all rows."""
+    tared = tared_counts(data)
+    parts, sizes = [], []
+    for start in range(0, len(tared), _ROWS):
+        rows = slice(start, start + _ROWS)
+        answers = _answers(bundle, tared[rows])
+        field = answers["displacement"].reshape(-1, *data.mesh.nodes.shape)
+        parts.append(field_errors(field, data.displacement(rows), data.mesh.subset)["all_m"])
+        coefficients = answers.get("coefficients", np.zeros((len(field), 1)))
+        sizes.append(1e3 * np.linalg.norm(coefficients.astype(np.float64), axis=1))
+    return HeldOut(
+        {"displacement": np.concatenate(parts)},
+        np.concatenate(sizes),
+        tared,
+        np.linalg.norm(data.experiment.force.astype(np.float64), axis=1),
+        data.experiment.row_trajectory,
+    )
+
+
+def add_intervals(
+    old: Path, held_out: Path, out: Path, *, others: Sequence[Path] = (), unlike: float = UNLIKE
+) -> bytes:
+    """Write a bundle again with bounds of its errors; returns its digest.
+
+    Args:
+        old: Folder of the bundle, of the task ``features`` or ``field``.
+        held_out: Data set of presses that no training has seen: of features, or for fields a mixed
+            one, of the sensors that the bundle was made for.
+        out: Folder to write; must not exist. A number is the version.
+        others: Data sets of features of sensors that the bundle was not made for.
+        unlike: Share of the rows held out that may be flagged by their distance.
+
+    Raises:
+        BundleError: It breaks its contract, knows no training rows, or ``out`` exists.
+        DatasetError: A data set breaks its schema, holds too few presses, or was trained on.
+    """
+    refuse_existing(out)
+    bundle = read_bundle(old)
+    manifest = bundle.manifest
+    if bundle.known_inputs is None or manifest.task not in ("features", "field"):
+        raise BundleError(
+            f"{old}: a bundle of task {manifest.task!r} "
+            + ("has no bounds" if bundle.known_inputs else "that does not know its training rows"),
+            remedy="take a features or field bundle; add its training rows first with palpate train"
+            " upgrade",
+        )
+    if manifest.task == "features":
+        rows = open_dataset(held_out)
+        digest, source = rows.content_sha256(), rows.provenance
+        found = held_out_features(bundle, rows)
+    else:
+        mixed = read_mixed(held_out)
+        digest, source = content_sha256(mixed), mixed.experiment.provenance
+        found = held_out_fields(bundle, mixed)
+    presses = len(np.unique(found.press))
+    if digest == manifest.training_data_sha256:
+        raise DatasetError(
+            f"{held_out} is what the bundle was trained on",
+            remedy="take presses that no training has seen",
+        )
+    if presses < PRESSES_LEAST:
+        raise DatasetError(
+            f"{held_out} holds {presses} presses, {PRESSES_LEAST} are needed",
+            remedy="record or simulate more",
+        )
+    known = known_by(bundle.known_inputs, found, unlike)
+    formulas = fit_formulas(found.errors, found.terms(known), found.press)
+    other, other_source = _of_others(bundle, known, others)
+    intervals = Intervals(
+        LEVEL,
+        f"{len(found.press)} rows of {presses} presses that no training saw, of {source.source}"
+        f" ({source.command})",
+        digest,
+        presses,
+        formulas,
+        other,
+        other_source,
+    )
+    version = int(out.name) if out.name.isdigit() else manifest.version
+    return write_bundle(
+        out,
+        model=bundle.model,
+        golden=bundle.golden,
+        manifest=replace(manifest, intervals=intervals, version=version),
+        mesh=bundle.mesh,
+        known_inputs=known,
+    )
+
+
+def known_by(known: KnownInputs, held_out: HeldOut, unlike: float) -> KnownInputs:
+    """The same representatives, with the metric of today, and with the limit of held-out presses.
+
+    Of these a share ``unlike`` of the rows of the next press is farther.
+    """
+    known = replace(known, metric=metric_of(known.prototypes), distance_max=1.0)
+    distance, _ = places_of(known, held_out.tared)
+    limit = press_quantile(distance, held_out.press, 1.0 - unlike)
+    return replace(known, distance_max=float(f"{limit:.6g}"))
+
+
+def _of_others(
+    bundle: Bundle, known: KnownInputs, others: Sequence[Path]
+) -> tuple[tuple[BoundFormula, ...], str]:
+    """Formulas of sensors that the bundle was not made for, and where they come from."""
+    if not others:
+        return (), ""
+    if bundle.manifest.task != "features":
+        raise DatasetError(
+            "no other sensor's fields are known", remedy="give other sensors for features only"
+        )
+    sets = [open_dataset(path) for path in others]
+    parts = [held_out_features(bundle, data) for data in sets]
+    together = {
+        name: np.concatenate([part.errors[name] for part in parts])
+        for name in ("force_magnitude", "force")
+    }
+    first = np.cumsum([0, *(int(part.press.max()) + 1 for part in parts)])
+    press = np.concatenate([part.press + start for part, start in zip(parts, first, strict=False)])
+    terms = np.vstack([part.terms(known) for part in parts])
+    names = ", ".join(name for data in sets for name in data.sensor_names)
+    return (
+        fit_formulas(together, terms, press, use=OF_OTHERS),
+        f"{len(press)} rows of {names}, for which it was not made; another sensor may need more",
+    )
+
+
+def _answers(bundle: Bundle, tared: FloatArray) -> dict[str, FloatArray]:
+    """Outputs of a bundle's model by name."""
+    names = [tensor.name for tensor in bundle.manifest.outputs]
+    feeds = {bundle.manifest.inputs[0].name: np.asarray(tared, np.float32)}
+    return dict(zip(names, session_of(bundle.model).run(names, feeds), strict=True))
