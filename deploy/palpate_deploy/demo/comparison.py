@@ -43,7 +43,10 @@ Vector = npt.NDArray[Any]
 
 @dataclass(frozen=True, slots=True)
 class TouchMoment:
-    """One frame: forces [N], locations [m], each of shape ``(3,)``; None where there is none."""
+    """One frame: forces [N], locations [m], each of shape ``(3,)``; None where there is none.
+
+    ``bound`` is what the estimate says that its force may be off by [N].
+    """
 
     force: Vector
     true_force: Vector
@@ -51,15 +54,21 @@ class TouchMoment:
     true_location: Vector | None
     in_contact: bool
     age_s: float
+    bound: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class TouchMedians:
-    """Median errors of touched frames, per axis, [N] and [m]; median age of all estimates [s]."""
+    """Median errors of touched frames, per axis, [N] and [m]; median age of all estimates [s].
+
+    ``held_share`` is the share of touched frames whose force's error is within its bound; None
+    without bounds.
+    """
 
     force_axes_n: Vector
     location_axes_m: Vector
     age_s: float
+    held_share: float | None = None
 
 
 class TouchComparison:
@@ -73,6 +82,7 @@ class TouchComparison:
         self._force_errors: list[Vector] = []
         self._location_errors: list[Vector] = []
         self._ages_s: list[float] = []
+        self._held: list[bool] = []
 
     def subscribe(self, session: Session, sensor: str) -> None:
         """Subscribe to estimates and truth of a sensor."""
@@ -110,11 +120,15 @@ class TouchComparison:
             true_location=pose.position if pose is not None and touched else None,
             in_contact=touched,
             age_s=age_s,
+            bound=None if estimate.bounds is None else estimate.bounds.force,
         )
         self.newest = moment
         if np.linalg.norm(moment.true_force) < TOUCHED_N:
             return
         self._force_errors.append(moment.force - moment.true_force)
+        if moment.bound is not None:
+            error_n = float(np.linalg.norm(self._force_errors[-1]))
+            self._held.append(error_n <= moment.bound)
         if moment.location is not None and moment.true_location is not None:
             self._location_errors.append(moment.location - moment.true_location)
 
@@ -125,6 +139,7 @@ class TouchComparison:
             force_axes_n=np.median(np.abs(force), axis=0),
             location_axes_m=np.median(np.abs(location), axis=0),
             age_s=float(np.median(self._ages_s)) if self._ages_s else float("nan"),
+            held_share=float(np.mean(self._held)) if self._held else None,
         )
 
 

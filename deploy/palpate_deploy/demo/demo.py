@@ -145,6 +145,15 @@ def _table(comparison: TouchComparison, fields: FieldMedians, left_s: float) -> 
         f"{fields.field_m * 1e3:.3f}",
     )
     table.add_row("electrodes from the field [counts]", "", "", "", f"{fields.counts:.0f}")
+    if moment.bound is not None and medians.held_share is not None:
+        off_n = float(((moment.force - moment.true_force) ** 2).sum() ** 0.5)
+        table.add_row(
+            escape("force, may be off by [N]"),
+            "",
+            f"{moment.bound:.2f}",
+            f"{off_n:.2f}",
+            f"held {medians.held_share:.0%}",
+        )
     touched = "[green]touched[/]" if moment.in_contact else "[dim]untouched[/]"
     table.caption = (
         f"{touched}   {comparison.count:,} estimates   age {moment.age_s * 1e3:.1f} ms"
@@ -159,6 +168,8 @@ def _line(moment: TouchMoment) -> str:
         f"force [N] truth {truth[0]:+.2f} {truth[1]:+.2f} {truth[2]:+.2f}"
         f"  estimate {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f}"
     )
+    if moment.bound is not None:
+        line += f" +- {moment.bound:.2f}"
     if moment.location is not None and moment.true_location is not None:
         away_mm = float(((moment.location - moment.true_location) ** 2).sum() ** 0.5) * 1e3
         line += f"  location off by {away_mm:.2f} mm"

@@ -187,6 +187,8 @@ def error_lines(errors: RecordErrors) -> list[str]:
         "  true force      frames   force error [N]        location error [mm]",
         "                           median  90 % below     median  90 % below",
     ]
+    if touched.held_share is not None:
+        lines.insert(1, f"the force is within its bound in {touched.held_share:.1%} of them")
     for each in errors.bins:
         cells = [
             _digits(each.force_median_n, "N"),

@@ -286,7 +286,9 @@ def _newtons(force: FloatArray) -> str:
 def _estimate(message: FeatureEstimate) -> str:
     flags = "".join(f", {flag.name}" for flag in message.quality)
     bundle = f"{message.bundle_name}:{message.bundle_version}"
-    return f"{_newtons(message.force)} by {printable(bundle)}{flags}"
+    bounds = message.bounds
+    doubt = "" if bounds is None or bounds.force is None else f" +- {bounds.force:.2f} N"
+    return f"{_newtons(message.force)}{doubt} by {printable(bundle)}{flags}"
 
 
 def look(session: Session, tare: Tare, seconds: float, console: Console) -> None:

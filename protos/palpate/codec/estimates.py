@@ -80,8 +80,8 @@ _BOUNDS = ("force_magnitude", "force", "contact_location", "displacement")
 
 
 def _bounds_from_wire(msg: estimates_pb2.ErrorBounds) -> ErrorBounds:
-    values = [getattr(msg, name) if msg.HasField(name) else None for name in _BOUNDS]
-    return _checked_bounds(ErrorBounds(msg.level, *values, other_sensors=msg.other_sensors))
+    given = {name: getattr(msg, name) for name in _BOUNDS if msg.HasField(name)}
+    return _checked_bounds(ErrorBounds(msg.level, **given, other_sensors=msg.other_sensors))
 
 
 def _bounds_to_wire(bounds: ErrorBounds) -> estimates_pb2.ErrorBounds:

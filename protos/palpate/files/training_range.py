@@ -50,14 +50,14 @@ class KnownInputs:
 def known_inputs_to_bytes(known: KnownInputs) -> bytes:
     """The file ``range.npz``."""
     buffer = io.BytesIO()
-    metric = {} if known.metric is None else {"metric": known.metric}
-    np.savez_compressed(
-        buffer,
-        prototypes=known.prototypes,
-        scale=np.float64(known.scale),
-        distance_max=np.float64(known.distance_max),
-        **metric,
-    )
+    arrays: dict[str, Any] = {
+        "prototypes": known.prototypes,
+        "scale": np.float64(known.scale),
+        "distance_max": np.float64(known.distance_max),
+    }
+    if known.metric is not None:
+        arrays["metric"] = known.metric
+    np.savez_compressed(buffer, **arrays)
     return buffer.getvalue()
 
 

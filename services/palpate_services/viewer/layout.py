@@ -217,6 +217,7 @@ def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[
         yield f"force/{axis}/estimate", line(f"{axis} estimate", [ESTIMATE_COLOUR], 4.0)
     for what, name in (("force", "force error"), ("location_mm", "location error")):
         yield f"error/{what}", line(name, [ERROR_COLOUR], 1.5)
+        yield f"error/{what}/bound", line("bound of 90 %", [QUIET_COLOUR], 1.0)
     if kind is SensorType.BIOTAC:
         vertices, triangles, normals = core_mesh()
         core = rr.Mesh3D(

@@ -47,7 +47,10 @@ BATCH_MESSAGES = 200
 ARROW_M_PER_N = 2e-3
 """Length of a force arrow [m/N]."""
 
-_CURVES = ("electrodes/raw", "electrodes/tared", "error/force", "error/location_mm", "synthesised")
+_CURVES = (
+    "electrodes/raw", "electrodes/tared", "error/force", "error/force/bound", "error/location_mm",
+    "error/location_mm/bound", "synthesised",
+)  # fmt: skip
 
 Send = Callable[[str, list[Any], Iterable[Any]], None]
 

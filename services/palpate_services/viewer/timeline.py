@@ -221,7 +221,8 @@ class SensorTimeline:
         NaN where not valid. Of ``truth`` and ``estimate`` each: ``force/...`` [N], shape ``(3,)``;
         ``arrow/...``, the same at instants when it is known where it acts, or that nothing touches;
         ``location/...`` [m], shape ``(3,)`` or None; ``field/...``, each a ``FieldRow``.
-        ``error/force`` [N] and ``error/location_mm`` [mm]: magnitudes, shape ``(1,)``.
+        ``error/force`` [N] and ``error/location_mm`` [mm]: magnitudes, shape ``(1,)``; with
+        ``/bound`` what the estimate says that they may be, NaN where it does not.
         ``synthesised``: tared counts synthesised from a field, shape ``(19,)``.
         """
         rows, self._rows, self.pending = self._rows, defaultdict(list), False
@@ -255,6 +256,15 @@ class SensorTimeline:
         self._rows["location/estimate"].append(_row(estimate.source, location))
         self._add_error("force", estimate.source, instant.force_error())
         self._add_location_error(estimate.source, instant)
+        if (bounds := estimate.bounds) is not None:
+            place = bounds.contact_location
+            for what, bound in (
+                ("force", bounds.force),
+                ("location_mm", None if place is None else _MM_PER_M * place),
+            ):
+                # A gap in the line where there is none.
+                values = np.array([np.nan if bound is None else bound])
+                self._rows[f"error/{what}/bound"].append(_row(estimate.source, values))
 
     def _add_field(self, name: str, known: FieldFrame) -> None:
         self.has_fields = True

@@ -42,6 +42,8 @@ class ForceBin:
         located: How many have a contact location, estimated and true.
         location_median_m: Median length of the location's error [m]; None without any.
         location_p90_m: 90 % of these errors are below it [m].
+        held_share: Share of the frames whose force's error is within the bound that the estimate
+            gives; None without bounds.
     """
 
     least_n: float
@@ -52,6 +54,7 @@ class ForceBin:
     located: int
     location_median_m: float | None
     location_p90_m: float | None
+    held_share: float | None = None
 
     @property
     def name(self) -> str:
@@ -118,18 +121,21 @@ class RecordedTouches:
 
 def bins_of(matched: Iterable[MatchedMessages]) -> tuple[ForceBin, ...]:
     """Errors of touched frames, of each range of ``FORCE_EDGES_N``, and of all frames."""
-    forces, locations = [], []
+    forces, locations, held = [], [], []
     for each in matched:
         force, location = each.force_error(), each.location_error()
         if force is None or each.wrench is None:
             continue
         size_n = float(np.linalg.norm(each.wrench.force))
         forces.append((size_n, float(np.linalg.norm(force))))
+        bounds = None if each.estimate is None else each.estimate.bounds
+        if bounds is not None and bounds.force is not None:
+            held.append((size_n, float(forces[-1][1] <= bounds.force)))
         if location is not None:
             locations.append((size_n, float(np.linalg.norm(location))))
     tops = (*FORCE_EDGES_N[1:], None)
     ranges = [(TOUCHED_N, None), *zip(FORCE_EDGES_N, tops, strict=True), (0.0, None)]
-    return tuple(_bin(least, below, forces, locations) for least, below in ranges)
+    return tuple(_bin(least, below, forces, locations, held) for least, below in ranges)
 
 
 def _bin(
@@ -137,12 +143,13 @@ def _bin(
     below_n: float | None,
     forces: list[tuple[float, float]],
     locations: list[tuple[float, float]],
+    held: list[tuple[float, float]],
 ) -> ForceBin:
     def within(pairs: list[tuple[float, float]]) -> list[float]:
         top = np.inf if below_n is None else below_n
         return [error for size_n, error in pairs if least_n <= size_n < top]
 
-    force, location = within(forces), within(locations)
+    force, location, bounded = within(forces), within(locations), within(held)
     return ForceBin(
         least_n,
         below_n,
@@ -150,6 +157,7 @@ def _bin(
         *_middle_and_tail(force),
         len(location),
         *_middle_and_tail(location),
+        float(np.mean(bounded)) if bounded else None,
     )
 
 

@@ -121,7 +121,8 @@ def _nearest(
     own = np.einsum("ij,ij->i", rows, rows)
     theirs = np.einsum("ij,ij->i", representatives, representatives)
     squared = theirs - 2.0 * (rows @ representatives.T)
-    return np.sqrt(np.maximum(squared.min(axis=1) + own, 0.0)).astype(np.float64)
+    nearest: npt.NDArray[np.float64] = np.maximum(squared.min(axis=1) + own, 0.0).astype(np.float64)
+    return np.sqrt(nearest)
 
 
 def _squared_distance(rows: FloatArray, norms: FloatArray, at: int) -> FloatArray:

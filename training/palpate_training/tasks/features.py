@@ -176,7 +176,7 @@ def train_features(
             data.group,
         )
 
-    seen = known_inputs(x[split.train], data.group[split.train])
+    trained = known_inputs(x[split.train], data.group[split.train])
     force_sd = _residual_sd(validated[:, :3], data.force[split.validation])
     graph = FeaturesGraph(net, force_sd, contact_sd)
     digest = export_features(
@@ -204,9 +204,9 @@ def train_features(
         },
         seed=seed,
         training_range=features_range(data, split.train),
-        known_inputs=seen,
+        known_inputs=trained,
         sensor_serials=tuple(serials),
-        intervals=_intervals(data, tested, split.test, threshold, seen),
+        intervals=_intervals(data, tested, split.test, threshold, trained),
     )
     return FeaturesReport(
         digest, metrics, (len(split.train), len(split.validation), len(split.test))
