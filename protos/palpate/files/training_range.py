@@ -11,9 +11,11 @@ import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from palpate.errors import BundleError, printable
 from palpate.files.bounded import arrays_of_npz
@@ -21,6 +23,8 @@ from palpate.messages import FloatArray, TensorInfo, TrainingRange, ValueRange
 
 RANGE_BYTES_MAX = 1 << 20
 """Size of ``range.npz``, and of what its arrays expand to [bytes]."""
+
+IndexArray = npt.NDArray[np.intp]
 
 PROTOTYPES_MAX = 4096
 _WIDTH_MAX = 64
@@ -36,15 +40,47 @@ class KnownInputs:
     Attributes:
         prototypes: Representatives, compressed, float32, shape ``(P, I)``.
         scale: In the unit of the input, positive.
-        distance_max: From here on an input is unlike all training rows.
-        metric: Distances are of compressed rows times this matrix, float32, shape ``(I, I)``, which
-            stretches directions in which the training rows hardly vary; None = they are plain.
+        distance_max: No training row is farther from its nearest representative.
+        pattern: How values go together; it replaces the distance. None = the distance is used.
     """
 
     prototypes: FloatArray
     scale: float
     distance_max: float
-    metric: FloatArray | None = None
+    pattern: InputPattern | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class InputPattern:
+    """How the values of an input go together in all that a model was trained on or measured with.
+
+    Of compressed values, ``arcsinh(value / scale)``, and their products (``pattern_terms``) some
+    combinations hardly vary; an input in which one of these is large is unlike the others. The
+    strangeness of an input is the root mean square of ``(terms - centre) @ weights``.
+
+    Attributes:
+        scale: In the unit of the input, positive.
+        centre: Means of the terms, float32, shape ``(T,)``.
+        weights: Float32, shape ``(T, T)``: combinations in the columns, over their spread.
+        most: From this strangeness on an input is unlike all known ones, positive.
+    """
+
+    scale: float
+    centre: FloatArray
+    weights: FloatArray
+    most: float
+
+
+def pattern_terms(compressed: FloatArray) -> FloatArray:
+    """Values and all their products, ``(..., I)`` to ``(..., I (I + 3) / 2)``."""
+    first, second = _pairs(compressed.shape[-1])
+    products = compressed[..., first] * compressed[..., second]
+    return np.concatenate([compressed, products], axis=-1)
+
+
+@cache
+def _pairs(width: int) -> tuple[IndexArray, IndexArray]:
+    return np.triu_indices(width)
 
 
 def known_inputs_to_bytes(known: KnownInputs) -> bytes:
@@ -55,8 +91,13 @@ def known_inputs_to_bytes(known: KnownInputs) -> bytes:
         "scale": np.float64(known.scale),
         "distance_max": np.float64(known.distance_max),
     }
-    if known.metric is not None:
-        arrays["metric"] = known.metric
+    if (pattern := known.pattern) is not None:
+        arrays |= {
+            "pattern_scale": np.float64(pattern.scale),
+            "pattern_centre": pattern.centre,
+            "pattern_weights": pattern.weights,
+            "pattern_most": np.float64(pattern.most),
+        }
     np.savez_compressed(buffer, **arrays)
     return buffer.getvalue()
 
@@ -73,7 +114,7 @@ def known_inputs_from_bytes(data: bytes, width: int, where: str) -> KnownInputs:
             arrays["prototypes"],
             float(arrays["scale"]),
             float(arrays["distance_max"]),
-            arrays.get("metric"),
+            _pattern_of(arrays),
         )
         problem = _problem(found, width)
     except (ValueError, KeyError, TypeError) as error:
@@ -93,16 +134,33 @@ def _problem(known: KnownInputs, width: int) -> str:
         return f"{len(prototypes)} prototypes of {width} values are not at most {PROTOTYPES_MAX}"
     if not np.isfinite(prototypes).all():
         return "prototypes hold NaN or infinity"
-    metric = known.metric
-    if metric is not None:
-        if metric.dtype != np.float32 or metric.shape != (width, width):
-            return f"metric is {metric.dtype}{list(metric.shape)}, not float32[{width}, {width}]"
-        if not np.isfinite(metric).all():
-            return "metric holds NaN or infinity"
-    for name, value in (("scale", known.scale), ("distance_max", known.distance_max)):
+    numbers = {"scale": known.scale, "distance_max": known.distance_max}
+    if (pattern := known.pattern) is not None:
+        terms = width * (width + 3) // 2
+        for name, array, shape in (
+            ("pattern_centre", pattern.centre, (terms,)),
+            ("pattern_weights", pattern.weights, (terms, terms)),
+        ):
+            if array.dtype != np.float32 or array.shape != shape:
+                return f"{name} is {array.dtype}{list(array.shape)}, not float32{list(shape)}"
+            if not np.isfinite(array).all():
+                return f"{name} holds NaN or infinity"
+        numbers |= {"pattern_scale": pattern.scale, "pattern_most": pattern.most}
+    for name, value in numbers.items():
         if not (math.isfinite(value) and value > 0):
             return f"{name} is {value}, not a positive number"
     return ""
+
+
+def _pattern_of(arrays: Mapping[str, Any]) -> InputPattern | None:
+    if not any(name.startswith("pattern") for name in arrays):
+        return None
+    return InputPattern(
+        float(arrays["pattern_scale"]),
+        arrays["pattern_centre"],
+        arrays["pattern_weights"],
+        float(arrays["pattern_most"]),
+    )
 
 
 def parse_training_range(

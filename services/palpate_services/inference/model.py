@@ -20,7 +20,7 @@ import numpy.typing as npt
 from palpate.errors import BundleError
 from palpate.files.bundle import Bundle, Manifest
 from palpate.files.intervals import bound_terms, bounds_of
-from palpate.files.training_range import KnownInputs
+from palpate.files.training_range import InputPattern, KnownInputs, pattern_terms
 from palpate.messages import (
     ErrorBounds,
     FloatArray,
@@ -50,7 +50,10 @@ class RangeCheck:
         self._known = known
         self._inputs = [] if known is None else [_Ends(one) for one in known.inputs]
         self._outputs = [] if known is None else [(one.name, _Ends(one)) for one in known.outputs]
-        self._combinations = None if inputs is None else _Combinations(inputs)
+        self._combinations: _Combinations | _Pattern | None = None
+        if inputs is not None:
+            pattern = inputs.pattern
+            self._combinations = _Combinations(inputs) if pattern is None else _Pattern(pattern)
 
     @classmethod
     def of(cls, bundle: Bundle) -> RangeCheck:
@@ -137,8 +140,7 @@ class Place(NamedTuple):
     """Where an input lies among those of the training.
 
     Attributes:
-        distance: From the nearest of their representatives, over the limit: above one it is unlike
-            all of them.
+        distance: How far it is from them, over the limit: above one it is unlike all of them.
         common: Common mode: mean of the compressed values.
     """
 
@@ -151,22 +153,34 @@ class _Combinations:
 
     def __init__(self, known: KnownInputs) -> None:
         self._scale = float(known.scale)
-        self._metric = None if known.metric is None else known.metric.astype(np.float64)
         prototypes = known.prototypes.astype(np.float64)
-        if self._metric is not None:
-            prototypes = prototypes @ self._metric
         # |q - p|^2 = |q|^2 + (|p|^2 - 2 q.p): what does not depend on q is computed once.
         self._squared = np.einsum("ij,ij->i", prototypes, prototypes)
-        self._minus_twice = np.ascontiguousarray(-2.0 * prototypes)
+        self._minus_twice = -2.0 * prototypes
         self._limit = float(known.distance_max)
 
     def place(self, sample: FloatArray) -> Place:
         compressed = [asinh(value / self._scale) for value in sample.tolist()]
         where = np.array(compressed)
-        if self._metric is not None:
-            where = where @ self._metric
         nearest = float((self._minus_twice @ where + self._squared).min()) + float(where @ where)
         return Place(sqrt(max(nearest, 0.0)) / self._limit, sum(compressed) / len(compressed))
+
+
+class _Pattern:
+    """Which values occur together: how strange their combinations are."""
+
+    def __init__(self, known: InputPattern) -> None:
+        self._scale = float(known.scale)
+        terms = len(known.centre)
+        # The root of a mean over the limit is the length of a vector, scaled so.
+        weights = known.weights / np.float32(known.most * sqrt(terms))
+        self._weights = np.ascontiguousarray(weights.T)
+        self._centre = known.centre
+
+    def place(self, sample: FloatArray) -> Place:
+        compressed = [asinh(value / self._scale) for value in sample.tolist()]
+        odd = self._weights @ (pattern_terms(np.array(compressed, np.float32)) - self._centre)
+        return Place(sqrt(float(odd @ odd)), sum(compressed) / len(compressed))
 
 
 _log = logging.getLogger(__name__)

@@ -4,16 +4,21 @@ The ends of every value, and representatives of the inputs: rows of the training
 that lies farthest from those chosen before. So the last distance is a radius within which *every*
 training row has a representative. A press that was never seen lies farther away, though the network
 is good for it; how far is learned by holding presses out.
+
+Where there are presses enough, also how the values go together (docs/adr/0031): of the values and
+their products the combinations that hardly vary. A press moves all electrodes by what happens to
+one skin over one core, and an input that breaks these rules is odd long before it is far.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from palpate.files.training_range import KnownInputs
+from palpate.files.training_range import InputPattern, KnownInputs, pattern_terms
 from palpate.messages import FloatArray, ValueRange
 
 PROTOTYPES = 256
@@ -26,11 +31,20 @@ untouched finger drifts and is noisy by about as much."""
 ACCEPTED = 0.98
 """Share of the rows of presses held out that shall lie within the limit."""
 
-SHRINK = 3.0
-"""Variance added to that of every direction before it is divided by its root [compressed counts^2]:
-chosen on each of two real fingers for the other, which agree (docs/results/quality.md)."""
-
 _FOLDS = 5
+
+PATTERN_SCALE_COUNTS = 60.0
+PATTERN_SHRINK = 0.001
+"""Compression of the values, and what is added to the variance of each combination over that of one
+term: chosen on each of two real fingers for the other (docs/results/intervals.md)."""
+
+UNLIKE = 0.01
+"""Share of the rows of a press held out that may be flagged by the pattern."""
+
+PRESSES_OF_PATTERN = 50
+"""Fewer presses do not know 209 combinations."""
+
+_PATTERN_FOLDS = 9
 
 
 def ends_of(name: str, unit: str, rows: npt.NDArray[np.floating]) -> ValueRange:
@@ -63,30 +77,52 @@ def known_inputs(
     representatives, and no training row lies beyond it.
     """
     compressed = np.arcsinh(rows / np.float32(scale)).astype(np.float32)
-    every = _spread(compressed, most)
-    metric = metric_of(every)
-    radius = float(_nearest(compressed @ metric, every @ metric).max())
+    every, radius = _spread(compressed, most)
     names = np.unique(groups)
     parts = np.array_split(np.random.default_rng(0).permutation(names), min(_FOLDS, len(names)))
     held = [np.isin(groups, part) for part in parts if len(parts) > 1]
-    distances = [
-        _nearest(compressed[out] @ metric, _spread(compressed[~out], most) @ metric) for out in held
-    ]
+    distances = [_nearest(compressed[out], _spread(compressed[~out], most)[0]) for out in held]
     unseen = float(np.quantile(np.concatenate(distances), ACCEPTED)) if distances else 0.0
     # A handful of rows may all be representatives of their own; noise must still be let through.
-    return KnownInputs(every, scale, max(1.001 * radius, unseen, 1e-3), metric)
+    known = KnownInputs(every, scale, max(1.001 * radius, unseen, 1e-3))
+    return known if len(names) < PRESSES_OF_PATTERN else with_pattern(known, rows, groups)[0]
 
 
-def metric_of(representatives: FloatArray, shrink: float = SHRINK) -> FloatArray:
-    """The matrix that makes directions count more in which representatives ``(P, I)`` vary less.
+def with_pattern(
+    known: KnownInputs,
+    rows: npt.NDArray[np.floating],
+    groups: npt.NDArray[np.integer],
+    *,
+    unlike: float = UNLIKE,
+    scale: float = PATTERN_SCALE_COUNTS,
+    shrink: float = PATTERN_SHRINK,
+) -> tuple[KnownInputs, npt.NDArray[np.float64]]:
+    """The same with a pattern of its representatives and of rows ``(N, I)``.
 
-    A press moves the electrodes together, in few ways; what is not one of these ways is odd long
-    before it is large.
+    ``groups`` names the press of each row. The limit leaves out a share ``unlike`` of the rows of
+    presses that the pattern was made without; each press counts the same.
+
+    Returns:
+        What is known then, and how strange each row is without its press, over the limit.
     """
-    centred = representatives.astype(np.float64) - representatives.mean(axis=0)
-    variance, directions = np.linalg.eigh(centred.T @ centred / len(centred))
-    scaled = directions / np.sqrt(np.maximum(variance, 0.0) + shrink)
-    return np.asarray(scaled @ directions.T, np.float32)
+    whole = np.sinh(known.prototypes.astype(np.float64)) * known.scale
+    strange = np.zeros(len(rows))
+    names = np.random.default_rng(0).permutation(np.unique(groups))
+    for part in np.array_split(names, min(_PATTERN_FOLDS, len(names))):
+        out = np.isin(groups, part)
+        without = _pattern(np.vstack([whole, rows[~out]]), scale, shrink)
+        strange[out] = strangeness(without, rows[out])
+    pattern = _pattern(np.vstack([whole, rows]), scale, shrink)
+    most = _share_below(strange, groups, 1.0 - unlike)
+    return replace(known, pattern=replace(pattern, most=_shorter(most))), strange / most
+
+
+def strangeness(pattern: InputPattern, rows: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """Of each row ``(N, I)``, over the limit, shape ``(N,)``: above one it is flagged."""
+    compressed = np.arcsinh(rows.astype(np.float64) / pattern.scale)
+    odd = (pattern_terms(compressed) - pattern.centre) @ pattern.weights
+    found: npt.NDArray[np.float64] = np.sqrt(np.mean(odd**2, axis=1)) / pattern.most
+    return found
 
 
 def places_of(
@@ -95,34 +131,55 @@ def places_of(
     """Where rows ``(N, I)`` lie, as a service finds it.
 
     Returns:
-        Distance of each from the nearest representative, over the limit; and its common mode.
+        How far each is from the known ones, over the limit; and its common mode.
     """
+    if known.pattern is not None:
+        common = np.arcsinh(rows.astype(np.float64) / known.pattern.scale).mean(axis=1)
+        return strangeness(known.pattern, rows), common
     compressed = np.arcsinh(rows.astype(np.float64) / known.scale)
-    metric = np.eye(rows.shape[1]) if known.metric is None else known.metric.astype(np.float64)
-    distance = _nearest(compressed @ metric, known.prototypes.astype(np.float64) @ metric)
+    distance = _nearest(compressed, known.prototypes.astype(np.float64)).astype(np.float64)
     return distance / known.distance_max, compressed.mean(axis=1)
 
 
-def _spread(rows: FloatArray, most: int) -> FloatArray:
-    """Representatives of rows."""
+def _pattern(rows: npt.NDArray[np.floating], scale: float, shrink: float) -> InputPattern:
+    """The pattern of rows, with a limit of one."""
+    terms = pattern_terms(np.arcsinh(rows.astype(np.float64) / scale))
+    centre, spread = terms.mean(axis=0), terms.std(axis=0)
+    spread = np.where(spread > 0.0, spread, 1.0)
+    scaled = (terms - centre) / spread
+    variance, directions = np.linalg.eigh(scaled.T @ scaled / len(scaled))
+    weights = directions / np.sqrt(np.maximum(variance, 0.0) + shrink) / spread[:, None]
+    return InputPattern(scale, centre.astype(np.float32), weights.astype(np.float32), 1.0)
+
+
+def _share_below(
+    values: npt.NDArray[np.float64], groups: npt.NDArray[np.integer], share: float
+) -> float:
+    """The value below which this share of the rows lies, each group counting the same."""
+    _, number, rows = np.unique(groups, return_inverse=True, return_counts=True)
+    order = np.argsort(values, kind="stable")
+    weight = np.cumsum(1.0 / rows[number[order]]) / len(rows)
+    return float(values[order][min(int(np.searchsorted(weight, share)), len(values) - 1)])
+
+
+def _spread(rows: FloatArray, most: int) -> tuple[FloatArray, float]:
+    """Representatives of rows, and the largest distance of any row from its nearest."""
     norms = np.einsum("ij,ij->i", rows, rows)
     chosen = [int(np.argmax(norms))]
     squared = _squared_distance(rows, norms, chosen[0])
     for _ in range(min(most, len(rows)) - 1):
         chosen.append(int(np.argmax(squared)))
         squared = np.minimum(squared, _squared_distance(rows, norms, chosen[-1]))
-    return rows[chosen]
+    return rows[chosen], float(np.sqrt(max(float(squared.max()), 0.0)))
 
 
-def _nearest(
-    rows: npt.NDArray[np.floating], representatives: npt.NDArray[np.floating]
-) -> npt.NDArray[np.float64]:
+def _nearest(rows: FloatArray, representatives: FloatArray) -> npt.NDArray[np.floating]:
     """Distance of each row from its nearest representative, shape ``(N,)``."""
     own = np.einsum("ij,ij->i", rows, rows)
     theirs = np.einsum("ij,ij->i", representatives, representatives)
     squared = theirs - 2.0 * (rows @ representatives.T)
-    nearest: npt.NDArray[np.float64] = np.maximum(squared.min(axis=1) + own, 0.0).astype(np.float64)
-    return np.sqrt(nearest)
+    distances: npt.NDArray[np.floating] = np.sqrt(np.maximum(squared.min(axis=1) + own, 0.0))
+    return distances
 
 
 def _squared_distance(rows: FloatArray, norms: FloatArray, at: int) -> FloatArray:

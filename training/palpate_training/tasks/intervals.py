@@ -1,7 +1,8 @@
 """A bundle with bounds of its errors, from presses that its training has not seen.
 
-The weights stay what they are, so do its answers and its metrics. The held-out presses also say
-from where on an input is unlike the training rows; nothing is learned from them but these two.
+The weights stay what they are, so do its answers and its metrics. From the held-out presses it also
+learns how the values of an input go together: what is known is then what it was trained on and what
+it was measured with.
 """
 
 from __future__ import annotations
@@ -20,22 +21,13 @@ from palpate.files.training_range import KnownInputs
 from palpate_training.datasets.experiment import MixedDataset, content_sha256, read_mixed
 from palpate_training.datasets.features import FeatureDataset, FloatArray, open_dataset
 from palpate_training.learning.export import refuse_existing, session_of
-from palpate_training.learning.intervals import (
-    LEVEL,
-    fit_formulas,
-    press_quantile,
-    terms_of,
-)
+from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
 from palpate_training.learning.metrics import field_errors, force_errors, location_errors
-from palpate_training.learning.ranges import metric_of, places_of
+from palpate_training.learning.ranges import UNLIKE, places_of, with_pattern
 from palpate_training.tasks.fields import tared_counts
 
 Floats = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.integer]
-
-UNLIKE = 0.005
-"""Share of the rows of held-out presses that may be flagged as unlike the training rows by their
-distance; ends of single values flag some more."""
 
 PRESSES_LEAST = 20
 """Of fewer presses nine tenths are not known well enough to be shipped with a bundle."""
@@ -64,10 +56,10 @@ class HeldOut:
     force_n: Floats
     press: Labels
 
-    def terms(self, known: KnownInputs) -> Floats:
-        """Terms of the bounds, with distances from these representatives."""
-        distance, common = places_of(known, self.tared)
-        return terms_of(self.size, common, distance)
+    def terms(self, known: KnownInputs, distance: Floats | None = None) -> Floats:
+        """Terms of the bounds, with distances from these inputs, or with those that are given."""
+        found, common = places_of(known, self.tared)
+        return terms_of(self.size, common, found if distance is None else distance)
 
 
 def held_out_features(bundle: Bundle, data: FeatureDataset) -> HeldOut:
@@ -160,8 +152,8 @@ def add_intervals(
             f"{held_out} holds {presses} presses, {PRESSES_LEAST} are needed",
             remedy="record or simulate more",
         )
-    known = known_by(bundle.known_inputs, found, unlike)
-    formulas = fit_formulas(found.errors, found.terms(known), found.press)
+    known, strange = with_pattern(bundle.known_inputs, found.tared, found.press, unlike=unlike)
+    formulas = fit_formulas(found.errors, found.terms(known, strange), found.press)
     other, other_source = _of_others(bundle, known, others)
     intervals = Intervals(
         LEVEL,
@@ -182,17 +174,6 @@ def add_intervals(
         mesh=bundle.mesh,
         known_inputs=known,
     )
-
-
-def known_by(known: KnownInputs, held_out: HeldOut, unlike: float) -> KnownInputs:
-    """The same representatives, with the metric of today, and with the limit of held-out presses.
-
-    Of these a share ``unlike`` of the rows of the next press is farther.
-    """
-    known = replace(known, metric=metric_of(known.prototypes), distance_max=1.0)
-    distance, _ = places_of(known, held_out.tared)
-    limit = press_quantile(distance, held_out.press, 1.0 - unlike)
-    return replace(known, distance_max=float(f"{limit:.6g}"))
 
 
 def _of_others(
