@@ -1,0 +1,217 @@
+"""Bounds of errors: whether they hold what they promise, on presses that no one has seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.errors import BundleError, DatasetError
+from palpate.files.bundle import read_bundle
+from palpate.files.training_range import KnownInputs
+from palpate_training.datasets.features import FeatureDataset, write_dataset
+from palpate_training.learning.features_net import FeaturesNetConfig
+from palpate_training.learning.intervals import (
+    EVERY_TERM,
+    LEVEL,
+    Floats,
+    Labels,
+    bounds,
+    covered,
+    fit_formula,
+    fit_formulas,
+    press_quantile,
+    terms_of,
+)
+from palpate_training.learning.ranges import known_inputs, places_of, strangeness, with_pattern
+from palpate_training.tasks.features import train_features
+from palpate_training.tasks.finger import train_finger
+from palpate_training.tasks.intervals import PRESSES_LEAST, add_intervals, held_out_features
+
+MakeData = Callable[..., FeatureDataset]
+
+
+def _presses(seed: int, presses: int, rows: int = 40) -> tuple[Floats, Floats, Labels]:
+    """Errors that grow with the force and differ from press to press; terms; presses."""
+    rng = np.random.default_rng(seed)
+    size = rng.uniform(0.0, 10.0, (presses, rows))
+    each = np.exp(rng.normal(0.0, 0.5, (presses, 1)))
+    errors = np.abs(rng.normal(size=(presses, rows))) * each * (0.1 + 0.1 * size)
+    nothing = np.zeros(presses * rows)
+    press = np.repeat(np.arange(presses), rows)
+    return errors.ravel(), terms_of(size.ravel(), nothing, nothing), press
+
+
+def test_bounds_hold_on_presses_that_were_not_seen() -> None:
+    """On average over what might have been drawn, which is what conformal prediction promises."""
+    share = []
+    for seed in range(12):
+        errors, terms, press = _presses(seed, 40)
+        formula = fit_formula("force", errors, terms, press)
+        new_errors, new_terms, new_press = _presses(1000 + seed, 400)
+        share.append(covered(new_errors, bounds(formula, new_terms), new_press))
+    assert 0.89 < np.mean(share) < 0.95
+
+
+def test_bounds_follow_the_errors() -> None:
+    errors, terms, press = _presses(3, 60)
+    formula = fit_formula("force", errors, terms, press)
+    light, hard = (bounds(formula, terms_of(*np.array([[n], [0.0], [0.0]])))[0] for n in (0.5, 9.0))
+    assert 2.5 * light < hard < 15.0 * light  # the truth: 6.7 times as much
+    same = fit_formula("force", errors, terms, press, use=(True, *(False,) * 4))
+    assert same.weights[1:] == (0.0,) * 4
+    new_errors, new_terms, new_press = _presses(4, 400)
+    hardest = new_terms[:, 1] > np.log1p(8.0)
+    # One width for all frames holds too few hard ones; that is why it follows the frame.
+    in_hard = [
+        covered(new_errors[hardest], bounds(one, new_terms[hardest]), new_press[hardest])
+        for one in (formula, same)
+    ]
+    assert in_hard[0] > 0.85 > in_hard[1]
+
+
+def test_a_press_counts_once_however_long_it_is() -> None:
+    scores = np.concatenate([np.full(1000, 5.0), np.arange(1.0, 20.0)])
+    press = np.concatenate([np.zeros(1000, int), np.arange(1, 20)])
+    assert press_quantile(scores, press, 0.5) == 10.0
+    # 20 presses and the next one: nine tenths of 21 are 18.9.
+    assert press_quantile(scores, press, 0.9) == 18.0
+    # So few presses promise nothing: the worst that was seen is taken.
+    assert press_quantile(scores[-3:], press[-3:], 0.9) == 19.0
+
+
+def test_rows_without_an_error_do_not_count() -> None:
+    errors, terms, press = _presses(5, 30)
+    holes = errors.copy()
+    holes[::2] = np.nan
+    some = fit_formulas(
+        {"force": holes, "contact_location": np.full_like(errors, np.nan)}, terms, press
+    )
+    assert [one.name for one in some] == ["force"]
+    assert some[0] == fit_formula("force", errors[1::2], terms[1::2], press[1::2])
+
+
+@pytest.mark.parametrize("presses", [1, 2, 6])
+def test_few_presses_give_finite_bounds(presses: int) -> None:
+    errors, terms, press = _presses(6, presses)
+    formula = fit_formula("force", errors, terms, press, use=EVERY_TERM)
+    assert np.isfinite(bounds(formula, terms)).all()
+    assert covered(errors, bounds(formula, terms), press) > 0.9
+
+
+def test_errors_of_zero_have_a_bound() -> None:
+    errors, terms, press = _presses(7, 30)
+    formula = fit_formula("force", np.zeros_like(errors), terms, press)
+    assert (bounds(formula, terms) > 0.0).all()
+
+
+def _rows(data: FeatureDataset) -> KnownInputs:
+    return known_inputs(data.tared_counts, data.group)
+
+
+def test_a_pattern_knows_what_breaks_its_rules(press_data: MakeData) -> None:
+    """Electrodes that each lie where they always lie, but not together."""
+    rows = press_data(presses=80, rows=30).tared_counts
+    known = _rows(press_data(presses=80, rows=30))
+    assert known.pattern is not None
+    assert np.mean(strangeness(known.pattern, rows) > 1.0) < 0.02
+    mixed = np.column_stack([np.random.default_rng(k).permutation(rows[:, k]) for k in range(19)])
+    assert np.mean(strangeness(known.pattern, mixed) > 1.0) > 0.95
+    stuck = rows.copy()
+    stuck[:, 6] = 400.0
+    assert np.mean(strangeness(known.pattern, stuck) > 1.0) > 0.95
+
+
+def test_a_press_is_not_measured_with_its_own_rows(press_data: MakeData) -> None:
+    data = press_data(presses=60, rows=30)
+    bare = replace(_rows(data), pattern=None)
+    known, strange = with_pattern(bare, data.tared_counts, data.group)
+    assert known.pattern is not None
+    seen = strangeness(known.pattern, data.tared_counts)
+    assert strange.mean() > seen.mean()
+    flagged = [np.mean(strange[data.group == one] > 1.0) for one in np.unique(data.group)]
+    assert np.mean(flagged) <= 0.011
+
+
+def test_few_presses_know_no_pattern(press_data: MakeData) -> None:
+    known = _rows(press_data(presses=20))
+    assert known.pattern is None
+    distance, _ = places_of(known, press_data(presses=20).tared_counts)
+    assert (distance <= 1.0).mean() > 0.95
+
+
+QUICK = FeaturesNetConfig(members=2, width=32, blocks=1, epochs=25, batch_rows=64)
+
+
+@pytest.fixture
+def trained(press_data: MakeData, tmp_path: Path) -> Path:
+    write_dataset(tmp_path / "train.h5", press_data(presses=30))
+    train_features(tmp_path / "train.h5", tmp_path / "old", config=QUICK)
+    return tmp_path / "old"
+
+
+def test_a_trained_bundle_has_bounds(trained: Path) -> None:
+    intervals = read_bundle(trained).manifest.intervals
+    assert intervals is not None
+    assert intervals.level == LEVEL
+    assert [one.name for one in intervals.formulas] == [
+        "force_magnitude",
+        "force",
+        "contact_location",
+    ]
+    assert intervals.others == ()
+
+
+def test_a_bundle_gets_bounds_and_keeps_its_answers(
+    press_data: MakeData, trained: Path, tmp_path: Path
+) -> None:
+    held_out = press_data(presses=40, seed=1)
+    write_dataset(tmp_path / "held.h5", held_out)
+    other = replace(press_data(presses=8, seed=2), sensor_names=("another",))
+    write_dataset(tmp_path / "other.h5", other)
+    add_intervals(trained, tmp_path / "held.h5", tmp_path / "2", others=[tmp_path / "other.h5"])
+    old, new = read_bundle(trained), read_bundle(tmp_path / "2")
+    assert (new.model, new.manifest.metrics) == (old.model, old.manifest.metrics)
+    assert new.manifest.version == 2
+    for name, rows in old.golden.items():
+        np.testing.assert_array_equal(new.golden[name], rows)
+    intervals = new.manifest.intervals
+    assert intervals is not None
+    assert intervals.presses == 40
+    assert intervals.data_sha256 == held_out.content_sha256()
+    assert [one.name for one in intervals.others] == ["force_magnitude", "force"]
+    assert "another" in intervals.others_source
+    assert new.known_inputs is not None
+    found = held_out_features(new, held_out)
+    share = covered(
+        found.errors["force"],
+        bounds(intervals.formulas[1], found.terms(new.known_inputs)),
+        found.press,
+    )
+    assert share > 0.88
+
+
+def test_what_cannot_calibrate_is_refused(
+    press_data: MakeData, trained: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "2"
+    with pytest.raises(DatasetError, match="is what the bundle was trained on"):
+        add_intervals(trained, tmp_path / "train.h5", out)
+    write_dataset(tmp_path / "few.h5", press_data(presses=PRESSES_LEAST - 1, seed=1))
+    with pytest.raises(DatasetError, match=f"{PRESSES_LEAST} are needed"):
+        add_intervals(trained, tmp_path / "few.h5", out)
+    with pytest.raises(BundleError, match="exists and bundles are immutable"):
+        add_intervals(trained, tmp_path / "few.h5", trained)
+    assert not out.exists()
+
+
+def test_a_fingers_own_bundle_has_bounds(press_data: MakeData, tmp_path: Path) -> None:
+    data = press_data(presses=24)
+    train_finger(data, tmp_path / "b", name="features-mine", serials=["BT-7"])
+    intervals = read_bundle(tmp_path / "b").manifest.intervals
+    assert intervals is not None
+    assert [one.name for one in intervals.formulas] == ["force_magnitude", "force"]
+    assert "held out" in intervals.source
