@@ -71,8 +71,8 @@ def test_bounds_of_a_field_travel(examples: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("name", ["FeatureEstimate", "FieldEstimate"])
 def test_an_estimate_of_an_older_service_has_no_bounds(name: str, examples: dict[str, Any]) -> None:
-    of = codec.FEATURE_ESTIMATE if name == "FeatureEstimate" else codec.FIELD_ESTIMATE
-    came: Any = of.decode(of.encode(examples[name]))  # type: ignore[attr-defined]
+    of: Any = codec.FEATURE_ESTIMATE if name == "FeatureEstimate" else codec.FIELD_ESTIMATE
+    came: Any = of.decode(of.encode(examples[name]))
     assert came.bounds is None
 
 
@@ -89,7 +89,7 @@ def test_an_estimate_of_an_older_service_has_no_bounds(name: str, examples: dict
         {"displacement": 1e38},
     ],
 )
-def test_bounds_that_are_none(examples: dict[str, Any], changes: dict[str, float]) -> None:
+def test_bounds_that_are_none(examples: dict[str, Any], changes: dict[str, Any]) -> None:
     told = dataclasses.replace(
         examples["FeatureEstimate"], bounds=dataclasses.replace(BOUNDS, **changes)
     )
@@ -132,7 +132,8 @@ def test_the_interval_of_a_force_does_not_go_below_zero(examples: dict[str, Any]
 
 def test_a_formula_is_an_exponential_of_its_terms() -> None:
     terms = bound_terms(math.e - 1.0, -2.0, 0.5)
-    assert terms == pytest.approx((1.0, 1.0, 1.0, -2.0, 0.5))
+    assert terms == pytest.approx((1.0, 1.0, 0.0, -2.0, 0.5))
+    assert bound_terms(7.0, 0.0, 0.0)[1:3] == pytest.approx((math.log(8.0), math.log(2.0)))
     assert FORCE.bound(terms) == pytest.approx(math.exp(-1.0 + 0.5 + 0.125))
     # Far away nothing is known: it does not go on growing, and is finite in any case.
     far, farther = (FORCE.bound(bound_terms(1.0, 0.0, d)) for d in (DISTANCE_MOST, 1e9))

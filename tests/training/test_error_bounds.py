@@ -172,7 +172,7 @@ def test_a_bundle_gets_bounds_and_keeps_its_answers(
     write_dataset(tmp_path / "held.h5", held_out)
     other = replace(press_data(presses=8, seed=2), sensor_names=("another",))
     write_dataset(tmp_path / "other.h5", other)
-    add_intervals(trained, tmp_path / "held.h5", tmp_path / "2", others=[tmp_path / "other.h5"])
+    add_intervals(trained, [tmp_path / "held.h5"], tmp_path / "2", others=[tmp_path / "other.h5"])
     old, new = read_bundle(trained), read_bundle(tmp_path / "2")
     assert (new.model, new.manifest.metrics) == (old.model, old.manifest.metrics)
     assert new.manifest.version == 2
@@ -198,13 +198,13 @@ def test_what_cannot_calibrate_is_refused(
     press_data: MakeData, trained: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "2"
-    with pytest.raises(DatasetError, match="is what the bundle was trained on"):
-        add_intervals(trained, tmp_path / "train.h5", out)
+    with pytest.raises(DatasetError, match="was trained on one of"):
+        add_intervals(trained, [tmp_path / "train.h5"], out)
     write_dataset(tmp_path / "few.h5", press_data(presses=PRESSES_LEAST - 1, seed=1))
     with pytest.raises(DatasetError, match=f"{PRESSES_LEAST} are needed"):
-        add_intervals(trained, tmp_path / "few.h5", out)
+        add_intervals(trained, [tmp_path / "few.h5"], out)
     with pytest.raises(BundleError, match="exists and bundles are immutable"):
-        add_intervals(trained, tmp_path / "few.h5", trained)
+        add_intervals(trained, [tmp_path / "few.h5"], trained)
     assert not out.exists()
 
 

@@ -28,8 +28,11 @@ BOUNDS_OF_TASK: Mapping[str, tuple[str, ...]] = {
 }
 """Errors that estimates of a task may have bounds of."""
 
-TERMS = ("one", "size", "size squared", "common mode", "distance")
+TERMS = ("one", "size", "large size", "common mode", "distance")
 """What ``bound_terms`` gives, in this order."""
+
+LARGE = 3.0
+"""From this size on a bound may grow otherwise with it [N, or mm]."""
 
 DISTANCE_MOST = 4.0
 """Farther than so many limits from all training rows is as bad as this far: nothing is known there,
@@ -58,9 +61,9 @@ class BoundFormula:
 
     def bound(self, terms: tuple[float, ...]) -> float:
         """The bound where these are the terms, in ``unit``."""
-        one, size, squared, common, distance = self.weights
+        one, size, large, common, distance = self.weights
         a, b, c, d, e = terms
-        exponent = one * a + size * b + squared * c + common * d + distance * e
+        exponent = one * a + size * b + large * c + common * d + distance * e
         return exp(min(exponent, EXPONENT_MOST))
 
 
@@ -96,8 +99,11 @@ def bound_terms(size: float, common: float, distance: float) -> tuple[float, ...
         common: Common mode: mean of the electrodes, compressed as in ``KnownInputs``.
         distance: From the nearest training row, over the limit from which an input is flagged.
     """
-    large = log1p(size)
-    return 1.0, large, large * large, common, min(distance, DISTANCE_MOST)
+    grown = log1p(size)
+    return 1.0, grown, max(0.0, grown - _LARGE), common, min(distance, DISTANCE_MOST)
+
+
+_LARGE = log1p(LARGE)
 
 
 def parse_intervals(values: object, task: object) -> Intervals:

@@ -393,11 +393,14 @@ def train_upgrade(
 
 def train_intervals(
     bundle: Annotated[Path, typer.Argument(help="Folder of a features or field bundle.")],
-    data: Annotated[
-        Path,
-        typer.Argument(help="Presses that no training has seen: features (.h5); of fields mixed."),
-    ],
     out: Bundle,
+    held_out: Annotated[
+        list[Path],
+        typer.Option(
+            help="Presses (.h5) that no training has seen, features or mixed; repeatable.",
+            show_default=False,
+        ),
+    ],
     other: Annotated[
         list[Path] | None,
         typer.Option(
@@ -408,11 +411,11 @@ def train_intervals(
 ) -> None:
     """A bundle with bounds of its errors, from presses held out; weights and answers stay.
 
-    palpate train intervals models/features-twin/7 held-out.h5 models/features-twin/8
+    palpate train intervals models/features-twin/7 models/features-twin/8 --held-out mixed.h5
     """
     from palpate_training.tasks.intervals import add_intervals
 
-    digest = add_intervals(bundle, data, out, others=other or ())
+    digest = add_intervals(bundle, held_out, out, others=other or ())
     console.print(f"wrote {out}, digest {digest.hex()}")
 
 

@@ -35,6 +35,10 @@ a slope is not believed."""
 ERROR_LEAST = 1e-9
 """Smaller errors count as this large, so that they have a logarithm."""
 
+SIZES = 6
+"""Ranges of the size, evenly over its logarithm, that count the same in the regression: most rows
+are light touches, and the bound of a hard press must not be what suits these."""
+
 ROWS_OF_PRESS = 20
 """Rows of a press that the regression sees; neighbours say the same."""
 
@@ -139,7 +143,8 @@ def _regression(
     """Weights of the terms by which ``level`` of the values lie below, by quantile regression.
 
     A linear programme: what lies above a plane counts ``level``, what lies below the rest, each
-    press the same; the weights' size counts, too, but for that of the constant.
+    press and each range of sizes the same; the weights' size counts, too, but for that of the
+    constant.
     """
     kept = _thinned(press)
     terms, values, press = terms[kept], values[kept], press[kept]
@@ -148,7 +153,7 @@ def _regression(
     middle = terms[:, columns].mean(axis=0)
     inputs = np.column_stack([np.ones(len(terms)), (terms[:, columns] - middle) / spread])
     _, number, rows = np.unique(press, return_inverse=True, return_counts=True)
-    weight = 1.0 / rows[number]
+    weight = _balanced(1.0 / rows[number], terms[:, 1])
     # Unknowns: the weights as differences of two that are not negative, then above, then below.
     many, width = inputs.shape
     penalty = np.r_[0.0, np.full(width - 1, PENALTY)]
@@ -161,6 +166,14 @@ def _regression(
     weights[columns] = scaled[1:] / spread
     weights[0] = scaled[0] - middle @ weights[columns]
     return weights
+
+
+def _balanced(weight: Floats, size: Floats) -> Floats:
+    """Weights of rows, of the same sum, by which each of ``SIZES`` ranges counts the same."""
+    edges = np.linspace(size.min(), size.max(), SIZES + 1)[1:-1]
+    number = np.searchsorted(edges, size, side="right")
+    total = np.bincount(number, weight, SIZES)
+    return weight * weight.sum() / (np.count_nonzero(total) * total[number])
 
 
 def _thinned(press: Labels) -> Labels:

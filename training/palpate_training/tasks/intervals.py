@@ -10,15 +10,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import Bundle, read_bundle, write_bundle
+from palpate.files.hdf5 import schema_of
 from palpate.files.intervals import BoundFormula, Intervals
 from palpate.files.training_range import KnownInputs
 from palpate_training.datasets.experiment import MixedDataset, content_sha256, read_mixed
+from palpate_training.datasets.export import features
 from palpate_training.datasets.features import FeatureDataset, FloatArray, open_dataset
 from palpate_training.learning.export import refuse_existing, session_of
 from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
@@ -31,6 +34,8 @@ Labels = npt.NDArray[np.integer]
 
 PRESSES_LEAST = 20
 """Of fewer presses nine tenths are not known well enough to be shipped with a bundle."""
+
+_FEATURES = "palpate.features"
 
 OF_OTHERS = (True, True, False, False, False)
 """Terms of bounds for sensors that a bundle was not made for: two fingers cannot teach more."""
@@ -107,17 +112,22 @@ def held_out_fields(bundle: Bundle, data: MixedDataset) -> HeldOut:
 
 
 def add_intervals(
-    old: Path, held_out: Path, out: Path, *, others: Sequence[Path] = (), unlike: float = UNLIKE
+    old: Path,
+    held_out: Sequence[Path],
+    out: Path,
+    *,
+    others: Sequence[Path] = (),
+    unlike: float = UNLIKE,
 ) -> bytes:
     """Write a bundle again with bounds of its errors; returns its digest.
 
     Args:
         old: Folder of the bundle, of the task ``features`` or ``field``.
-        held_out: Data set of presses that no training has seen: of features, or for fields a mixed
-            one, of the sensors that the bundle was made for.
+        held_out: Data sets of presses that no training has seen: of features, or for fields mixed
+            ones, of the sensors that the bundle was made for. A mixed one is good for both.
         out: Folder to write; must not exist. A number is the version.
         others: Data sets of features of sensors that the bundle was not made for.
-        unlike: Share of the rows held out that may be flagged by their distance.
+        unlike: Share of the rows held out that may be flagged by how their values go together.
 
     Raises:
         BundleError: It breaks its contract, knows no training rows, or ``out`` exists.
@@ -133,23 +143,17 @@ def add_intervals(
             remedy="take a features or field bundle; add its training rows first with palpate train"
             " upgrade",
         )
-    if manifest.task == "features":
-        rows = open_dataset(held_out)
-        digest, source = rows.content_sha256(), rows.provenance
-        found = held_out_features(bundle, rows)
-    else:
-        mixed = read_mixed(held_out)
-        digest, source = content_sha256(mixed), mixed.experiment.provenance
-        found = held_out_fields(bundle, mixed)
+    sets = [read_held_out(bundle, path) for path in held_out]
+    found = joined([one.rows for one in sets])
     presses = len(np.unique(found.press))
-    if digest == manifest.training_data_sha256:
+    if any(one.sha256 == manifest.training_data_sha256 for one in sets):
         raise DatasetError(
-            f"{held_out} is what the bundle was trained on",
+            f"{old} was trained on one of {', '.join(map(str, held_out))}",
             remedy="take presses that no training has seen",
         )
     if presses < PRESSES_LEAST:
         raise DatasetError(
-            f"{held_out} holds {presses} presses, {PRESSES_LEAST} are needed",
+            f"{', '.join(map(str, held_out))}: {presses} presses, {PRESSES_LEAST} are needed",
             remedy="record or simulate more",
         )
     known, strange = with_pattern(bundle.known_inputs, found.tared, found.press, unlike=unlike)
@@ -157,9 +161,9 @@ def add_intervals(
     other, other_source = _of_others(bundle, known, others)
     intervals = Intervals(
         LEVEL,
-        f"{len(found.press)} rows of {presses} presses that no training saw, of {source.source}"
-        f" ({source.command})",
-        digest,
+        f"{len(found.press)} rows of {presses} presses that no training saw: "
+        + "; ".join(one.source for one in sets),
+        " ".join(one.sha256 for one in sets),
         presses,
         formulas,
         other,
@@ -176,6 +180,49 @@ def add_intervals(
     )
 
 
+class ReadRows(NamedTuple):
+    """Rows of a data set as a bundle sees them, the set's digest (hex), and what it is."""
+
+    rows: HeldOut
+    sha256: str
+    source: str
+
+
+def read_held_out(bundle: Bundle, path: Path) -> ReadRows:
+    """What a bundle makes of a data set of features, or of a mixed one."""
+    if bundle.manifest.task == "features" and schema_of(path, extra="training") == _FEATURES:
+        data = open_dataset(path)
+        return ReadRows(
+            held_out_features(bundle, data), data.content_sha256(), data.provenance.source
+        )
+    mixed = read_mixed(path)
+    about = mixed.experiment.provenance
+    rows = (
+        held_out_fields(bundle, mixed)
+        if bundle.manifest.task == "field"
+        else held_out_features(bundle, features(mixed))
+    )
+    return ReadRows(rows, content_sha256(mixed), f"{about.source} ({about.command})")
+
+
+def joined(parts: Sequence[HeldOut]) -> HeldOut:
+    """The rows of all; presses of different ones stay apart."""
+    first = np.cumsum([0, *(int(part.press.max()) + 1 for part in parts)])
+    press = [part.press + start for part, start in zip(parts, first, strict=False)]
+    names = set.intersection(*(set(part.errors) for part in parts))
+    return HeldOut(
+        {
+            name: np.concatenate([part.errors[name] for part in parts])
+            for name in parts[0].errors
+            if name in names
+        },
+        np.concatenate([part.size for part in parts]),
+        np.concatenate([part.tared for part in parts]),
+        np.concatenate([part.force_n for part in parts]),
+        np.concatenate(press),
+    )
+
+
 def _of_others(
     bundle: Bundle, known: KnownInputs, others: Sequence[Path]
 ) -> tuple[tuple[BoundFormula, ...], str]:
@@ -187,18 +234,12 @@ def _of_others(
             "no other sensor's fields are known", remedy="give other sensors for features only"
         )
     sets = [open_dataset(path) for path in others]
-    parts = [held_out_features(bundle, data) for data in sets]
-    together = {
-        name: np.concatenate([part.errors[name] for part in parts])
-        for name in ("force_magnitude", "force")
-    }
-    first = np.cumsum([0, *(int(part.press.max()) + 1 for part in parts)])
-    press = np.concatenate([part.press + start for part, start in zip(parts, first, strict=False)])
-    terms = np.vstack([part.terms(known) for part in parts])
+    rows = joined([held_out_features(bundle, data) for data in sets])
+    errors = {name: rows.errors[name] for name in ("force_magnitude", "force")}
     names = ", ".join(name for data in sets for name in data.sensor_names)
     return (
-        fit_formulas(together, terms, press, use=OF_OTHERS),
-        f"{len(press)} rows of {names}, for which it was not made; another sensor may need more",
+        fit_formulas(errors, rows.terms(known), rows.press, use=OF_OTHERS),
+        f"{len(rows.press)} rows of {names}, for which it was not made; another may need more",
     )
 
 
