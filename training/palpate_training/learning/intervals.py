@@ -173,7 +173,8 @@ def _balanced(weight: Floats, size: Floats) -> Floats:
     edges = np.linspace(size.min(), size.max(), SIZES + 1)[1:-1]
     number = np.searchsorted(edges, size, side="right")
     total = np.bincount(number, weight, SIZES)
-    return weight * weight.sum() / (np.count_nonzero(total) * total[number])
+    balanced: Floats = weight * weight.sum() / (np.count_nonzero(total) * total[number])
+    return balanced
 
 
 def _thinned(press: Labels) -> Labels:

@@ -192,9 +192,9 @@ def read_held_out(bundle: Bundle, path: Path) -> ReadRows:
     """What a bundle makes of a data set of features, or of a mixed one."""
     if bundle.manifest.task == "features" and schema_of(path, extra="training") == _FEATURES:
         data = open_dataset(path)
-        return ReadRows(
-            held_out_features(bundle, data), data.content_sha256(), data.provenance.source
-        )
+        about = data.provenance
+        rows, digest = held_out_features(bundle, data), data.content_sha256()
+        return ReadRows(rows, digest, f"{about.source} ({about.command})")
     mixed = read_mixed(path)
     about = mixed.experiment.provenance
     rows = (
