@@ -220,11 +220,15 @@ def real_cells(fingers: Sequence[FeatureDataset]) -> list[dict[str, Any]]:
                 (f"{who}, as if it were the twin's", intervals.formulas),
             ):
                 terms = tested.terms(known)
+                own = {one.name: bounds(one, terms) for one in intervals.formulas}
                 found += [
-                    cell(which, name, one.name, tested.errors[one.name], bounds(one, terms), tested)
+                    cell(
+                        which, name, one.name, tested.errors[one.name],
+                        np.maximum(bounds(one, terms), own[one.name]), tested,
+                    )
                     for one in formulas
                     if one.name in tested.errors
-                ]
+                ]  # fmt: skip
     return found
 
 

@@ -154,6 +154,7 @@ def test_which_bounds_an_estimate_gets() -> None:
     other = bounds_of(INTERVALS, terms, others=True)
     assert other is not None
     assert (other.other_sensors, other.contact_location) == (True, None)
+    assert other.force == own.force  # never closer than for its own sensors
     silent = dataclasses.replace(INTERVALS, others=())
     assert bounds_of(silent, terms, others=True) is None
 

@@ -118,5 +118,6 @@ def test_a_bound_of_another_sensor_is_no_narrower(
             assert answer.bounds is not None
             assert answer.bounds.force is not None
             found.append(answer.bounds.force)
+        assert found[1] >= found[0]
         wider += found[1] > found[0]
-    assert wider > 0.9 * len(rows)
+    assert wider > 0.7 * len(rows)

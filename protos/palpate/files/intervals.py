@@ -78,7 +78,8 @@ class Intervals:
         presses: Presses in it that no training saw, each counted once; one that several specimens
             executed counts once, too.
         formulas: One for each error that has a bound.
-        others: Formulas for sensors that the bundle was not made for; empty = nothing is known.
+        others: Formulas for sensors that the bundle was not made for; empty = nothing is known. The
+            larger of these and its own is what counts.
         others_source: What those come from, for people.
     """
 
@@ -164,6 +165,8 @@ def bounds_of(
 ) -> ErrorBounds | None:
     """Bounds of one estimate; None where the bundle has none for it.
 
+    For a sensor that it was not made for they are never closer than for one that it was made for.
+
     Args:
         intervals: Of the bundle.
         terms: Of the estimate.
@@ -176,4 +179,8 @@ def bounds_of(
     found = {
         one.name: one.bound(terms) for one in formulas if contact or one.name != "contact_location"
     }
+    if others:
+        for own in intervals.formulas:
+            if own.name in found:
+                found[own.name] = max(found[own.name], own.bound(terms))
     return ErrorBounds(intervals.level, **found, other_sensors=others)
