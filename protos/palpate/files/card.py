@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from palpate.files.bundle import Manifest
+from palpate.files.intervals import TERMS, Intervals
 from palpate.messages import TrainingRange, ValueRange
 
 TASK_WORDS = {
@@ -86,12 +87,40 @@ def model_card(manifest: Manifest, digest: bytes) -> str:
             "",
             *_table(("metric", "value", "unit"), map(_metric, sorted(manifest.metrics.items()))),
             "",
+            "## How far its estimates may be off",
+            "",
+            *_bounds(manifest.intervals),
+            "",
             "## Where it was trained",
             "",
             *_ranges(manifest.training_range),
             "",
         ]
     )
+
+
+def _bounds(intervals: Intervals | None) -> list[str]:
+    if intervals is None:
+        return ["Not known: estimates give no bounds."]
+    level = f"{intervals.level:.0%}"
+    lines = [
+        f"Estimates give bounds that hold in {level} of the presses like these: "
+        f"{intervals.source}.",
+        "",
+    ]
+    if not intervals.others:
+        lines.append("For sensors that it was not made for it gives none.")
+    else:
+        lines.append(f"For sensors that it was not made for, bounds by {intervals.others_source}.")
+    rows = [
+        (f"`{one.name}`", one.unit, whose, ", ".join(f"{weight:.4g}" for weight in one.weights))
+        for whose, some in (("its own", intervals.formulas), ("others", intervals.others))
+        for one in some
+    ]
+    return [*lines, "", *_table(("bound of", "unit", "sensors", f"weights of {_TERMS}"), rows)]
+
+
+_TERMS = ", ".join(TERMS)
 
 
 def _words_of(name: str) -> str:
