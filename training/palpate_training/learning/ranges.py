@@ -33,8 +33,8 @@ ACCEPTED = 0.98
 
 _FOLDS = 5
 
-PATTERN_SCALE_COUNTS = 60.0
-PATTERN_SHRINK = 0.001
+PATTERN_SCALE_COUNTS = 80.0
+PATTERN_SHRINK = 0.0003
 """Compression of the values, and what is added to the variance of each combination over that of one
 term: chosen on each of two real fingers for the other (docs/results/intervals.md)."""
 
