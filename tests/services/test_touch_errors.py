@@ -14,7 +14,14 @@ import pytest
 from palpate.bus.topics import TOPICS, sensor_key
 from palpate.errors import RecordingError
 from palpate.files.record import RecordWriter
-from palpate.messages import ElectrodeFrame, FeatureEstimate, IndenterPoseFrame, Stamp, WrenchFrame
+from palpate.messages import (
+    ElectrodeFrame,
+    ErrorBounds,
+    FeatureEstimate,
+    IndenterPoseFrame,
+    Stamp,
+    WrenchFrame,
+)
 from palpate_services.viewer.timeline import MatchedMessages, SensorTimeline, line_of_action
 from palpate_services.viewer.touch_errors import bins_of, read_touches
 
@@ -61,6 +68,35 @@ def stamp(make_frame: Frames) -> Stamp:
 
 def matched(stamp: Stamp, presses: Sequence[Press]) -> list[MatchedMessages]:
     return [MatchedMessages(*messages_of(stamp, press)) for press in presses]
+
+
+def test_how_often_bounds_hold_is_told_by_force(stamp: Stamp) -> None:
+    bounds = [0.5, 0.2, 0.5, None]
+    presses = [Press(3.0, 0.4), Press(3.0, 0.4), Press(0.7, 0.1), Press(3.0, 9.0)]
+    rows = matched(stamp, presses)
+    for row, bound in zip(rows, bounds, strict=True):
+        assert row.estimate is not None
+        given = None if bound is None else ErrorBounds(0.9, force=bound)
+        row.estimate = dataclasses.replace(row.estimate, bounds=given)
+    bins = bins_of(rows)
+    assert bins[0].frames == 4
+    assert bins[0].held_share == pytest.approx(2 / 3)  # that without a bound does not count
+    by_name = {each.name: each.held_share for each in bins}
+    assert by_name["2 to 8 N"] == pytest.approx(1 / 2)
+    assert by_name["0.5 to 1 N"] == 1.0
+    assert by_name["1 to 2 N"] is None
+
+
+def test_a_view_draws_bounds_beside_the_errors(stamp: Stamp) -> None:
+    timeline = SensorTimeline()
+    _, _, estimate = messages_of(stamp, Press(3.0, 0.4))
+    timeline.add(dataclasses.replace(estimate, bounds=ErrorBounds(0.9, 0.3, 0.5, 0.002)))
+    timeline.add(dataclasses.replace(estimate, bounds=ErrorBounds(0.9, force=7.0)))
+    timeline.add(estimate)
+    rows = timeline.take()
+    assert [row.values.tolist() for row in rows["error/force/bound"]] == [[0.5], [7.0]]
+    places = np.concatenate([row.values for row in rows["error/location_mm/bound"]])
+    np.testing.assert_allclose(places, [2.0, np.nan])
 
 
 def test_touched_frames_do_not_drown_in_untouched_ones(stamp: Stamp) -> None:
