@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from palpate_training.learning import baselines
 from palpate_training.learning.metrics import (
     cluster_bootstrap,
+    drawn_medians,
     force_errors,
     force_metrics,
+    interval,
     location_metrics,
     summarise,
 )
@@ -107,3 +110,11 @@ def test_baselines() -> None:
     np.testing.assert_allclose(baselines.linear(x, y).predict(x), y, atol=1e-8)
     np.testing.assert_allclose(baselines.constant(x, y).predict(x[:2]), [y.mean(axis=0)] * 2)
     assert not baselines.zero(x, y).predict(x).any()
+
+
+@pytest.mark.parametrize("errors", [np.zeros(0), np.full(4, np.nan)])
+def test_without_a_row_no_median_is_known(errors: npt.NDArray[np.float64]) -> None:
+    drawn = drawn_medians([errors], np.zeros(len(errors), np.int64), draws=7)
+    assert drawn.shape == (7,)
+    assert np.isnan(drawn).all()
+    assert np.isnan(interval(drawn)).all()

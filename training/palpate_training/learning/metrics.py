@@ -183,11 +183,13 @@ def drawn_medians(
 
     Args:
         errors: Of every row, shape (N,), one for each seed of a system; rows that are NaN do not
-            count.
+            count; without any row the medians are NaN.
         cluster: Trajectory of every row, shape (N,).
         draws: How many.
         seed: Of the draws.
     """
+    if any(np.isnan(values).all() for values in errors):
+        return np.full(draws, np.nan)
     names, number = np.unique(cluster, return_inverse=True)
     rng = np.random.default_rng(seed)
     counts = rng.multinomial(len(names), np.full(len(names), 1.0 / len(names)), size=draws)
@@ -204,7 +206,9 @@ def drawn_medians(
 
 
 def interval(drawn: Rows64, level: float = 0.95) -> tuple[float, float]:
-    """Ends of the interval that holds a share of the draws."""
+    """Ends of the interval that holds a share of the draws; NaN if all of them are."""
+    if np.isnan(drawn).all():
+        return float("nan"), float("nan")
     tail = 50.0 * (1.0 - level)
     low, high = np.nanpercentile(drawn, [tail, 100.0 - tail])
     return float(low), float(high)
