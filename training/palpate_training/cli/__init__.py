@@ -12,6 +12,7 @@ train_app = typer.Typer(
 train_app.command("force-real")(train.train_force_real)
 train_app.command("transfer")(train.train_transfer)
 train_app.command("population")(train.train_population_command)
+train_app.command("line")(train.train_line)
 train_app.command("features")(train.train_features_command)
 train_app.command("field")(train.train_field)
 train_app.command("synthesis")(train.train_synthesis)

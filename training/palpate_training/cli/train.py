@@ -222,6 +222,9 @@ def train_transfer(
         int, typer.Option(min=1, help="How often the presses are drawn; results are means.")
     ] = 12,
     seed: Annotated[int, typer.Option(help="Of the draws.")] = 0,
+    twin: Annotated[
+        bool, typer.Option(help="Whether a line through the twin's presses is the prior.")
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
     """Force on a finger that training has not met, and after a few presses of it.
@@ -235,7 +238,9 @@ def train_transfer(
         steps_of,
         worst_of,
     )
+    from palpate_training.learning.twin_line import read_line
 
+    line = read_line() if twin else None
     known = [finger for path in train for finger in fingers_of(open_dataset(path))]
     tested = fingers_of(open_dataset(test))
     with _progress(Console(stderr=True)) as progress:
@@ -249,6 +254,7 @@ def train_transfer(
                 unlabelled=shots > 0 if unlabelled is None else unlabelled,
                 draws=draws,
                 seed=seed,
+                line=line,
                 on_step=lambda: progress.advance(bar),
             )
             for finger in tested
@@ -369,6 +375,22 @@ def train_population_command(
                 if key != "ci95":
                     table.add_row(key, *(f"{one[key]:.3f}" for one in shots.values()))
             console.print(table)
+    console.print(f"wrote {out}")
+
+
+def train_line(
+    data: Annotated[
+        Path, typer.Argument(metavar="FEATURES.h5", help="Rows of a population of specimens.")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="LINE.json", help="File to write.")],
+) -> None:
+    """A line through a population's presses, for `palpate train transfer`.
+
+    palpate train line features.h5 twin-line.json
+    """
+    from palpate_training.learning.twin_line import fit_line, write_line
+
+    write_line(out, fit_line(open_dataset(data)))
     console.print(f"wrote {out}")
 
 

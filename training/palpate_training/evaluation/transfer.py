@@ -23,6 +23,7 @@ from palpate_training.datasets.container import add_array
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.learning.baselines import ridge
 from palpate_training.learning.metrics import force_errors
+from palpate_training.learning.twin_line import TwinLine
 from palpate_training.systems.transfer import (
     FingerRecording,
     ForceTransfer,
@@ -107,6 +108,7 @@ def run_transfer(
     unlabelled: bool = False,
     draws: int = 12,
     seed: int = 0,
+    line: TwinLine | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """Fit to some fingers, and measure on another.
@@ -118,6 +120,7 @@ def run_transfer(
         unlabelled: Whether mean and spread of its electrodes may be used.
         draws: How often the labelled presses are drawn; results are means over the draws.
         seed: Of the draws.
+        line: Prior of the magnitude, through a simulated population; None = none.
         on_step: Called ``steps_of`` times, for a progress bar.
 
     Returns:
@@ -142,9 +145,9 @@ def run_transfer(
             remedy=f"label at most {len(pieces) - 1}, so that some are left to test",
         )
     sources = [finger.recording for finger in train]
-    width = _width_on_others(train, on_step)
+    width = _width_on_others(train, line, on_step)
     rng = np.random.default_rng(seed)
-    model = ForceTransfer(sources)
+    model = ForceTransfer(sources, line)
     on_step()
     plain = model.estimate(test.recording, unlabelled=unlabelled)
     on_step()
@@ -184,6 +187,7 @@ def run_transfer(
         "unlabelled": unlabelled,
         "draws": draws if shots else 1,
         "seed": seed,
+        "twin": line is not None,
         "rows": len(test.recording.force),
     }
 
@@ -237,7 +241,9 @@ def _width(estimate: Floats, truth: Floats) -> float:
     return float(np.quantile(errors / (FLOOR_N + np.linalg.norm(estimate, axis=1)), LEVEL))
 
 
-def _width_on_others(train: Sequence[Finger], on_step: Callable[[], None]) -> float:
+def _width_on_others(
+    train: Sequence[Finger], line: TwinLine | None, on_step: Callable[[], None]
+) -> float:
     """The same from the training fingers: each estimated from the others, or a half from the other.
 
     Halves of one finger know nothing of what differs from finger to finger, so the intervals of one
@@ -254,7 +260,7 @@ def _width_on_others(train: Sequence[Finger], on_step: Callable[[], None]) -> fl
         held_out = [([halves[1 - k]], halves[k]) for k in range(2)]
     estimates, truths = [], []
     for sources, tested in held_out:
-        estimates.append(ForceTransfer(sources).estimate(tested, unlabelled=False))
+        estimates.append(ForceTransfer(sources, line).estimate(tested, unlabelled=False))
         truths.append(tested.force)
         on_step()
     return _width(np.vstack(estimates), np.vstack(truths))

@@ -11,7 +11,9 @@ From a finger's electrodes *without* forces comes more about the direction: a re
 spread, electrode by electrode, take the place of the other fingers'. From a few *labelled* presses
 comes a correction that reaches as far as what was pressed, by the common mode, too.
 
-A network of a simulated population helped in no way that was tried (training/LOG.md).
+The magnitude's processes start from a line through the presses of a simulated population, mapped to
+real fingers by what was learned on the others (``TwinLine``); what they learn is what that line
+leaves. A network of the population helped in no way that was tried (training/LOG.md).
 
 All constants were chosen on the two fingers of the LASA force calibration, in both directions, the
 worse counting, and then frozen (training/LOG.md).
@@ -30,6 +32,7 @@ from scipy.signal import lfilter
 
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
 from palpate_training.learning.electrode_nets import MIRROR_AXES
+from palpate_training.learning.twin_line import TwinLine
 from palpate_training.systems.samples import impedance_ohm
 
 Floats = npt.NDArray[np.float64]
@@ -202,13 +205,45 @@ class _Scale:
         return np.asarray(weight * (parts - self.centre) / self.spread)
 
 
+class _MappedLine:
+    """A line through the twin, and the linear map that takes its forces to those of real fingers.
+
+    Twin and real fingers differ alike for all fingers: in scale, and in how a finger sits.
+    """
+
+    def __init__(self, line: TwinLine, sources: Sequence[FingerRecording]) -> None:
+        """Fit the map to recordings and their mirror images."""
+        self._line = line
+        guess, force = (
+            np.vstack([*parts, *(part * MIRROR_AXES for part in parts)])
+            for parts in (
+                [line.force(source.electrodes, source.baseline) for source in sources],
+                [source.force for source in sources],
+            )
+        )
+        self._to_real = np.linalg.lstsq(guess, force, rcond=None)[0]
+
+    def __call__(self, recording: FingerRecording) -> Floats:
+        """Forces of all rows [N], shape (N, 3)."""
+        return np.asarray(
+            self._line.force(recording.electrodes, recording.baseline) @ self._to_real
+        )
+
+
 class _Process:
-    """One Gaussian process of the force."""
+    """One Gaussian process of the force, or of what a prior leaves of it."""
 
     def __init__(
-        self, sources: Sequence[FingerRecording], inputs: Inputs, kernel: Kernel, *, aligned: bool
+        self,
+        sources: Sequence[FingerRecording],
+        inputs: Inputs,
+        kernel: Kernel,
+        *,
+        prior: _MappedLine | None = None,
+        aligned: bool = False,
     ) -> None:
         self._inputs, self._kernel, self._aligned = inputs, kernel, aligned
+        self._prior = prior
         self._scale = _Scale.shared(sources, inputs)
         rows, targets = [], []
         for source in sources:
@@ -216,7 +251,8 @@ class _Process:
             some = np.unique(some)
             for one in (source, source.mirrored()):
                 rows.append(self._scale_of(one).apply(one, inputs, some))
-                targets.append(one.force[some])
+                known = 0.0 if prior is None else prior(one)[some]
+                targets.append(one.force[some] - known)
         self._rows = np.vstack(rows)
         force = np.vstack(targets)
         self._unit = force.std()
@@ -232,8 +268,9 @@ class _Process:
         everything = np.arange(len(recording.electrodes))
         rows = self._scale_of(recording).apply(recording, self._inputs, everything)
         parts = np.array_split(rows, max(1, len(rows) // 4000))
-        estimate = [self._kernel(part, self._rows) @ self._weight for part in parts]
-        return np.asarray(self._unit * np.vstack(estimate))
+        learned = np.vstack([self._kernel(part, self._rows) @ self._weight for part in parts])
+        known = 0.0 if self._prior is None else self._prior(recording)
+        return np.asarray(self._unit * learned + known)
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,14 +289,18 @@ class CorrectedForces:
 class ForceTransfer:
     """Estimates forces on fingers that are not among those it was fitted to."""
 
-    def __init__(self, sources: Sequence[FingerRecording]) -> None:
-        """Fit to recordings of other fingers, with their forces."""
+    def __init__(self, sources: Sequence[FingerRecording], line: TwinLine | None = None) -> None:
+        """Fit to recordings of other fingers, with their forces.
+
+        Args:
+            sources: The recordings.
+            line: Prior of the magnitude; None = none.
+        """
         self._sources = sources
         self._scale = _Scale.shared(sources, CORRECTION_INPUTS)
-        # Some estimate both magnitude and direction.
-        self._processes = {
-            each: _Process(sources, *each, aligned=False) for each in (*MAGNITUDE, *DIRECTION)
-        }
+        prior = None if line is None else _MappedLine(line, sources)
+        self._magnitude = [_Process(sources, *each, prior=prior) for each in MAGNITUDE]
+        self._direction = [_Process(sources, *each) for each in DIRECTION]
 
     @cached_property
     def _aligned(self) -> list[_Process]:
@@ -274,12 +315,11 @@ class ForceTransfer:
             unlabelled: Whether mean and spread of all its electrodes may be used, later rows
                 included; else a row's estimate follows from the tare and the rows before it.
         """
-        forces = {each: process(recording) for each, process in self._processes.items()}
-        direction = _mean_direction([forces[each] for each in DIRECTION])
+        direction = _mean_direction([process(recording) for process in self._direction])
         if unlabelled:
             direction += _mean_direction([process(recording) for process in self._aligned])
             direction = _unit(direction)
-        lengths = [np.linalg.norm(forces[each], axis=1) for each in MAGNITUDE]
+        lengths = [np.linalg.norm(process(recording), axis=1) for process in self._magnitude]
         return np.asarray(np.mean(lengths, axis=0)[:, None] * direction)
 
     def correct(
