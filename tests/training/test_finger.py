@@ -13,7 +13,8 @@ import torch
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import read_bundle
 from palpate_training.datasets.features import FeatureDataset
-from palpate_training.learning.force_process import Floats, ForceProcesses
+from palpate_training.learning.force_process import Floats, ForceProcesses, KnownRows
+from palpate_training.learning.twin_line import read_line
 from palpate_training.tasks import finger
 from palpate_training.tasks.finger import STEPS, known_rows, train_finger
 
@@ -124,3 +125,19 @@ def test_a_common_rise_of_all_impedances_turns_no_force_round(press_data: MakeDa
 
     cosine = np.sum(directions(known.tared[touched]) * directions(warmer), axis=1)
     assert np.median(np.arccos(np.clip(cosine, -1, 1))) < 0.05
+
+
+def test_presses_tell_the_scale_and_the_axes_of_the_twins_line() -> None:
+    """A finger whose forces are those of the line, stiffer and turned: nothing is left to learn."""
+    rng = np.random.default_rng(0)
+    rest = np.full(19, 3000.0)
+    tared = rng.normal(0.0, 120.0, (400, 19)).round()
+    line = read_line()
+    turn = np.array([[2.0, 0.0, 0.3], [0.0, 1.5, 0.0], [-0.2, 0.0, 2.5]])
+    force = line.force(rest + tared, np.tile(rest, (400, 1))) @ turn
+    known = KnownRows(tared[:200], force[:200], np.arange(200) // 10)
+    net = ForceProcesses(known, rest, local=0.1)
+    with torch.inference_mode():
+        found = net.twin(torch.from_numpy(tared[200:])).numpy()
+    error = np.linalg.norm(found - force[200:], axis=1)
+    assert np.median(error) < 0.15 * np.median(np.linalg.norm(force, axis=1))

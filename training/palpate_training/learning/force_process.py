@@ -4,7 +4,9 @@ A line on tared counts extrapolates well and bends nowhere; Gaussian processes o
 impedance follow the film, but a handful of presses says little about the electrodes' common mode,
 which the temperature moves. So the magnitude is the mean of a line and of two processes that see
 little of the common mode, and the direction is that of two processes that see even less of it:
-compared with each of them alone in training/LOG.md.
+compared with each of them alone in training/LOG.md. Those of the magnitude learn what a line
+through the twin leaves (``TwinLine``), whose scale and axes the presses tell: it holds where the
+finger has not been pressed yet.
 
 Everything is computed in double precision, also in the exported graph: the weights of a process
 nearly cancel, and single precision would lose what is left.
@@ -19,7 +21,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from palpate_training.learning.electrode_nets import log_impedance
+from palpate_training.learning.electrode_nets import MIRROR_AXES, log_impedance
+from palpate_training.learning.twin_line import TwinLine, read_line
 
 Floats = npt.NDArray[np.float64]
 
@@ -34,6 +37,9 @@ LINEAR = 1.5
 
 LOCALITIES = (0.1, 0.5)
 """``local`` of ``ForceProcesses`` to choose from."""
+
+MAP_PENALTY_N2 = 1.0
+"""Penalty of what maps the twin's forces to those of the finger, but for one factor [N^2]."""
 
 _COMMON_OF_MAGNITUDE = (0.1, 0.3)
 _COMMON_OF_DIRECTION = (0.0, 0.1)
@@ -84,7 +90,7 @@ class ForceLine(nn.Module):
 
 
 class ForceProcesses(nn.Module):
-    """Tared counts (N, 19) -> force [N], shape (N, 3), by a line and three Gaussian processes.
+    """Tared counts (N, 19) -> force [N], shape (N, 3), by a line and four Gaussian processes.
 
     Args:
         rows: What it is fitted to; at most a few hundred.
@@ -95,22 +101,55 @@ class ForceProcesses(nn.Module):
     def __init__(self, rows: KnownRows, rest: Floats, *, local: float) -> None:
         super().__init__()
         self.line = ForceLine(rows)
-        self._commons = sorted({*_COMMON_OF_MAGNITUDE, *_COMMON_OF_DIRECTION})
-        self.processes = nn.ModuleList(
-            _CommonModeProcess(rows, rest, common=common, local=local) for common in self._commons
+        self.twin = _MappedLine(read_line(), rows, rest)
+        with torch.inference_mode():
+            known = self.twin(torch.from_numpy(rows.tared)).numpy()
+        left = KnownRows(rows.tared, rows.force - known, rows.press)
+        self.magnitude, self.direction = (
+            nn.ModuleList(
+                _CommonModeProcess(some, rest, common=one, local=local) for one in commons
+            )
+            for some, commons in ((left, _COMMON_OF_MAGNITUDE), (rows, _COMMON_OF_DIRECTION))
         )
 
     def forward(self, tared: Tensor) -> Tensor:
         """Forces [N]."""
-        forces: dict[float, Tensor] = {
-            common: each(tared) for common, each in zip(self._commons, self.processes, strict=True)
-        }
-        parts = [self.line(tared).double(), *(forces[common] for common in _COMMON_OF_MAGNITUDE)]
+        twin = self.twin(tared)
+        parts = [self.line(tared).double(), *(twin + process(tared) for process in self.magnitude)]
         mean = torch.stack(parts).mean(dim=0)
         magnitude = torch.linalg.vector_norm(mean, dim=1, keepdim=True)
-        direction = torch.stack([_unit(forces[common]) for common in _COMMON_OF_DIRECTION])
+        direction = torch.stack([_unit(process(tared)) for process in self.direction])
         force: Tensor = magnitude * _unit(direction.sum(dim=0))
         return force.float()
+
+
+class _MappedLine(nn.Module):
+    """A line through the twin, mapped to a finger by rows of it."""
+
+    rest: Tensor
+    log_rest: Tensor
+    weight: Tensor
+    offset: Tensor
+
+    def __init__(self, line: TwinLine, rows: KnownRows, rest: Floats) -> None:
+        super().__init__()
+        for name, values in (("rest", rest), ("weight", line.weight), ("offset", line.offset)):
+            self.register_buffer(name, torch.from_numpy(values))
+        self.register_buffer("log_rest", log_impedance(self.rest))
+        with torch.inference_mode():
+            guess = self(torch.from_numpy(rows.tared)).numpy()
+        guess, force = (np.vstack([one, one * MIRROR_AXES]) for one in (guess, rows.force))
+        factor = np.sum(guess * force) / np.sum(guess * guess)
+        gram = guess.T @ guess + MAP_PENALTY_N2 * len(guess) * np.eye(3)
+        to_own = factor * np.eye(3) + np.linalg.solve(gram, guess.T @ (force - factor * guess))
+        self.weight = torch.from_numpy(line.weight @ to_own)
+        self.offset = torch.from_numpy(line.offset @ to_own)
+
+    def forward(self, tared: Tensor) -> Tensor:
+        """Forces [N], shape (N, 3), double."""
+        rise = log_impedance(self.rest + tared.double()) - self.log_rest
+        force: Tensor = (rise - rise.mean(dim=1, keepdim=True)) @ self.weight + self.offset
+        return force
 
 
 class _CommonModeProcess(nn.Module):
