@@ -50,6 +50,7 @@ _IMPORTS: dict[str, tuple[str, ...]] = {
     "recorder": ("zenoh", "numpy", "pydantic", "google.protobuf", "mcap.writer", "rerun"),
     "fem": ("zenoh", "numpy", "pydantic", "google.protobuf"),
     "metrics": ("zenoh", "numpy", "pydantic", "google.protobuf", "prometheus_client"),
+    "web": ("zenoh", "numpy", "pydantic", "google.protobuf", "waitress"),
 }
 
 # It writes its process id and goes on for ever.

@@ -80,6 +80,9 @@ def up(
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the resolved profile and exit.")
     ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve the page for browsers, too: [web] listen.")
+    ] = False,
 ) -> None:
     """Start a station's processes and keep them running until Ctrl-C."""
     import tomli_w
@@ -87,6 +90,8 @@ def up(
     from palpate_deploy.station.profile import load_profile, plain_values
 
     loaded = load_profile(profile)
+    if web and "web" not in loaded.processes:
+        loaded = loaded.model_copy(update={"processes": (*loaded.processes, "web")})
     if print_config:
         print(tomli_w.dumps(plain_values(loaded)), end="")
         return

@@ -32,6 +32,7 @@ _log = logging.getLogger(__name__)
 START_ORDER: tuple[Service, ...] = (
     "router",
     "metrics",
+    "web",
     "recorder",
     "ros_bridge",
     "synthesis",
@@ -108,6 +109,10 @@ def _entry_point(service: Service, profile: Profile) -> Callable[..., None]:
         from palpate_deploy.station.metrics import run_metrics
 
         return run_metrics
+    if service == "web":
+        from palpate_deploy.station.web.process import run_web
+
+        return run_web
     from palpate_services.inference.services import run_estimating
 
     return functools.partial(run_estimating, models=profile.models)
@@ -115,6 +120,7 @@ def _entry_point(service: Service, profile: Profile) -> Callable[..., None]:
 
 _NEEDED: dict[str, tuple[str, tuple[str, ...]]] = {
     "metrics": ("metrics", ("prometheus_client",)),
+    "web": ("web", ("waitress",)),
     "ros_bridge": ("services", ("rosbags",)),
     "features": ("services", ("onnxruntime",)),
     "field": ("services", ("onnxruntime",)),

@@ -59,6 +59,7 @@ Service = Literal[
     "recorder",
     "fem",
     "metrics",
+    "web",
     "ros_bridge",
 ]
 SERVICES: tuple[Service, ...] = ("router", "gateway", "features", "recorder")
@@ -104,6 +105,34 @@ class MetricsConfig(StrictConfig):
         return value
 
 
+class WebConfig(StrictConfig):
+    """The page of a station for browsers, which only shows.
+
+    Attributes:
+        listen: ``HOST:PORT``. Who reaches it sees everything; there is no password and no TLS.
+        names: Names of this host by which browsers may ask for it, beside ``localhost`` and
+            addresses.
+        live: Whether there is a live view.
+        bundles: Names or folders of bundles with meshes of its fields, beside the packaged ones.
+    """
+
+    listen: str = "127.0.0.1:7480"
+    names: tuple[str, ...] = ()
+    live: bool = True
+    bundles: tuple[str, ...] = ()
+
+    @field_validator("listen")
+    @classmethod
+    def _address(cls, value: str) -> str:
+        try:
+            _, port = endpoint_host_port(f"tcp/{value}")
+        except ValueError:
+            port = 0
+        if port == 0:
+            raise ValueError(f"{value!r} is not HOST:PORT, e.g. 127.0.0.1:7480")
+        return value
+
+
 class LogConfig(StrictConfig):
     """What the processes write into their logs.
 
@@ -132,6 +161,7 @@ class Profile(StrictConfig):
         models: The user's bundles, and what is remembered of those that serve.
         fem: How simulations are served, if ``processes`` names ``fem``.
         metrics: Where Prometheus finds metrics, if ``processes`` names ``metrics``.
+        web: Where browsers find the page, if ``processes`` names ``web``.
         ros_bridge: What nodes of ROS 2 get, if ``processes`` names ``ros_bridge``.
         log: What the processes write into their logs.
     """
@@ -148,6 +178,7 @@ class Profile(StrictConfig):
     models: ModelsConfig = Field(default_factory=ModelsConfig)
     fem: FemConfig = FemConfig()
     metrics: MetricsConfig = MetricsConfig()
+    web: WebConfig = WebConfig()
     ros_bridge: RosBridgeConfig = Field(default_factory=RosBridgeConfig)
     log: LogConfig = LogConfig()
 

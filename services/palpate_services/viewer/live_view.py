@@ -18,8 +18,8 @@ import subprocess
 import sys
 import threading
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
@@ -28,6 +28,7 @@ from palpate.bus.topics import TOPICS
 from palpate.errors import PalpateError
 from palpate.heartbeat import without_watch
 from palpate.process import use_few_resources
+from palpate_services.viewer.layout import SensorContents
 
 _log = logging.getLogger(__name__)
 
@@ -54,16 +55,22 @@ class ViewPlan:
     """What a live view is to be.
 
     Attributes:
-        path: Its ``.rrd``.
+        path: Its ``.rrd``; None = no file, the drawn parts are handed over.
         title: Shown as the recording's name.
         max_bytes: It is closed at this size [bytes].
         bundles: Names or folders of bundles with meshes of its fields, beside the packaged ones.
+        period_s: Time between two updates [s].
+        recording_id: Views with the same one are one recording to the viewer; None = its own.
+        known: What has been laid out before; a layout is drawn where there is more to show.
     """
 
-    path: Path
+    path: Path | None
     title: str
     max_bytes: int
     bundles: tuple[str, ...]
+    period_s: float = PERIOD_S
+    recording_id: str | None = None
+    known: Mapping[str, SensorContents] = field(default_factory=dict)
 
 
 class ViewMessage(NamedTuple):
@@ -75,22 +82,42 @@ class ViewMessage(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class DrawnPart:
+    """A piece of a view without a file.
+
+    Attributes:
+        data: A complete ``.rrd`` of what came since the last part.
+        layout: A complete ``.rbl`` where the layout has changed; else empty.
+        contents: What the layout shows, by sensor.
+    """
+
+    data: bytes
+    layout: bytes
+    contents: Mapping[str, SensorContents]
+
+
+@dataclass(frozen=True, slots=True)
 class ViewReport:
     """The child's answer to each batch: what it counted since the last one, or why it gave up."""
 
     counts: Mapping[str, int]
     problem: str | None = None
+    part: DrawnPart | None = None
 
 
 class LiveView:
     """Has a record's view drawn; it may fail, hang or crash, the record goes on.
 
     Counts ``view_dropped`` (messages came too fast), ``view_failed`` (the view was given up), and
-    what the view counts, e.g. ``view_no_mesh``.
+    what the view counts, e.g. ``view_no_mesh``. The parts of a view without a file are handed to
+    ``take_part``, in a thread of this object.
     """
 
-    def __init__(self, plan: ViewPlan) -> None:
+    def __init__(
+        self, plan: ViewPlan, take_part: Callable[[DrawnPart], None] | None = None
+    ) -> None:
         self._plan = plan
+        self._take_part = take_part
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._waiting: deque[ViewMessage] = deque()
@@ -142,19 +169,22 @@ class LiveView:
         try:
             with self._started() as connection:
                 self._tell(connection, self._plan)
-                while not self._stop.wait(PERIOD_S):
+                while not self._stop.wait(self._plan.period_s):
                     self._update(connection)
                 self._update(connection)
                 self._tell(connection, None)
         except Exception as error:
             # A defect of the picture must be visible in the log, and must not stop the record.
             why = str(error) if isinstance(error, _ViewLost) else repr(error)
-            _log.warning(
-                "the view is given up, the record goes on: %s: %s; when it is closed, make a view "
-                "of it with: palpate review",
-                self._plan.path,
-                why,
-            )
+            if self._plan.path is None:
+                _log.warning("the live view is given up: %s", why)
+            else:
+                _log.warning(
+                    "the view is given up, the record goes on: %s: %s; when it is closed, make a "
+                    "view of it with: palpate review",
+                    self._plan.path,
+                    why,
+                )
             with self._lock:
                 self._counts["view_failed"] += 1
                 self._given_up = True
@@ -209,6 +239,8 @@ class LiveView:
             self._counts.update(report.counts)
         if report.problem is not None:
             raise _ViewLost(report.problem)
+        if report.part is not None and self._take_part is not None:
+            self._take_part(report.part)
 
 
 class _ViewLost(Exception):
@@ -238,7 +270,13 @@ def _draw(plan: ViewPlan, connection: Connection) -> None:
 
     meshes = MeshLibrary(plan.bundles)
     with RerunView(
-        plan.path, title=plan.title, max_bytes=plan.max_bytes, meshes=meshes, live=True
+        plan.path,
+        title=plan.title,
+        max_bytes=plan.max_bytes,
+        meshes=meshes,
+        live=True,
+        recording_id=plan.recording_id,
+        known=plan.known,
     ) as view:
         connection.send(ViewReport({}))
         for batch in _batches(connection):
@@ -247,7 +285,8 @@ def _draw(plan: ViewPlan, connection: Connection) -> None:
             view.flush()
             counts = dict(view.counters)
             view.counters.clear()
-            connection.send(ViewReport(counts))
+            part = None if plan.path is not None else DrawnPart(*view.take(), view.contents)
+            connection.send(ViewReport(counts, part=part))
     connection.send(ViewReport({}))
 
 

@@ -8,8 +8,9 @@ module that uses Rerun, whose names change with each release.
 from __future__ import annotations
 
 import logging
+import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,8 @@ class FieldDrawer:
 class RerunView:
     """Writes one ``.rrd``, which is closed at ``max_bytes``. Use from one thread.
 
+    Without a ``path`` there is no file, but ``take`` returns what has been drawn; views with one
+    ``recording_id`` are then one recording to the viewer, whose layout shows ``known``, too.
     ``title`` is shown as the recording's name; ``meshes`` None = those of the packaged bundles.
     A ``live`` view may go on for days and takes less. Of the PAC samples, 2,200 a second and
     sensor, it draws the smallest and the largest of each frame. It has no footer, whose parts Rerun
@@ -116,12 +119,14 @@ class RerunView:
 
     def __init__(
         self,
-        path: Path,
+        path: Path | None,
         *,
         title: str,
         max_bytes: int | None = None,
         meshes: MeshLibrary | None = None,
         live: bool = False,
+        recording_id: str | None = None,
+        known: Mapping[str, SensorContents] | None = None,
     ) -> None:
         self._rr = require("rerun", extra="services")
         self._live = live
@@ -130,7 +135,11 @@ class RerunView:
         self._max_bytes = max_bytes
         self._scenes: dict[str, SensorTimeline] = {}
         self._drawn: dict[str, SensorContents] = {}
-        self._stream = self._rr.RecordingStream(APPLICATION)
+        self.contents: Mapping[str, SensorContents] = dict(known or {})
+        """What the layout shows, by sensor."""
+        self._layout = b""
+        self._drawn_bytes: Any = None  # Rerun's, of a view without a file
+        self._stream = self._rr.RecordingStream(APPLICATION, recording_id=recording_id)
         library = MeshLibrary() if meshes is None else meshes
         self._fields = FieldDrawer(self._rr, self._stream, library)
         self._open = False
@@ -182,8 +191,19 @@ class RerunView:
             self.close()
             self.full = True
 
+    def take(self) -> tuple[bytes, bytes]:
+        """Of a view without a file, since the last call: what was drawn, and the layout if changed.
+
+        Both are complete: an ``.rrd`` and an ``.rbl``; empty = nothing.
+        """
+        drawn = b"" if self._drawn_bytes is None else self._drawn_bytes.read() or b""
+        layout, self._layout = self._layout, b""
+        return drawn, layout
+
     def size(self) -> int:
         """Bytes on disk so far."""
+        if self.path is None:
+            return 0
         try:
             return self.path.stat().st_size
         except FileNotFoundError:
@@ -210,11 +230,23 @@ class RerunView:
         before, self._drawn = self._drawn, drawn
         if drawn == before:
             return
-        layout = record_layout(dict(sorted(drawn.items())))
-        if self._open:
+        contents = {**self.contents}
+        for sensor, one in drawn.items():
+            had = contents.get(sensor, one)
+            contents[sensor] = SensorContents(
+                one.kind, one.tared or had.tared, one.fields or had.fields
+            )
+        layout = record_layout(dict(sorted(contents.items())))
+        if self.path is None:
+            if not self._open:
+                self._drawn_bytes = self._stream.binary_stream()
+            if contents != self.contents:
+                self._layout = _layout_bytes(layout)
+        elif self._open:
             self._stream.send_blueprint(layout)
         else:
             self._stream.save(self.path, layout, write_footer=not self._live)
+        self.contents = contents
         if not self._open:
             self._stream.send_recording_name(self._title)
             self._open = True
@@ -293,6 +325,14 @@ class RerunView:
             rr.TimeColumn(SEQUENCE, sequence=sequence),
         ]
         self._stream.send_columns(entity, times, columns)
+
+
+def _layout_bytes(layout: Any) -> bytes:
+    """A layout as Rerun's ``.rbl``, which it writes into files only."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "layout.rbl"
+        layout.save(APPLICATION, path)
+        return path.read_bytes()
 
 
 def _extremes(samples: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:

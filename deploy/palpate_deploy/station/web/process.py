@@ -1,0 +1,157 @@
+"""The process ``web``: serves a page with the status and the live view of a station.
+
+The server's threads answer from memory; what is asked of the station does not depend on how many
+ask, or how slowly they read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from palpate.bus import Session
+from palpate.config import LinkConfig, endpoint_host_port
+from palpate.errors import LinkError, MissingExtraError
+from palpate.health import Health, HealthReporter
+from palpate.heartbeat import beat
+from palpate.messages import ServiceState
+from palpate.process import check_installed, require
+from palpate_deploy.station.observation import StationObserver
+from palpate_deploy.station.profile import WebConfig
+from palpate_deploy.station.web.application import WebApplication
+from palpate_deploy.station.web.snapshot import as_json, snapshot
+
+_log = logging.getLogger(__name__)
+
+SERVICE = "web"
+
+CONNECTIONS_MOST = 50
+"""Further ones wait until one of these is closed."""
+
+IDLE_S = 20
+"""A connection on which nothing has gone in or out for so long is closed [s]."""
+
+_THREADS = 4
+_HEADER_BYTES_MOST = 16_384
+_LOOK_S = 1.0
+_TURN_S = 0.05
+_POLL_S = 1.0
+
+
+def run_web(
+    config: WebConfig,
+    link: LinkConfig,
+    station: str,
+    stop: threading.Event,
+    *,
+    instance: str = SERVICE,
+) -> None:
+    """Serve the page of a station until ``stop`` is set.
+
+    Raises:
+        LinkError: The bus cannot be joined, or the address cannot be used.
+        MissingExtraError: waitress is not installed.
+    """
+    require("waitress", extra="web")
+    health = Health(SERVICE, instance)
+    with Session.open(link, station=station) as session, contextlib.ExitStack() as stack:
+        view: Any = None
+        files: Any = None
+        if config.live and _has_rerun():
+            from palpate_services.viewer.viewer_files import ViewerFiles
+            from palpate_services.viewer.watched_view import WatchedView
+
+            view = stack.enter_context(WatchedView(session, title=station, bundles=config.bundles))
+            files = ViewerFiles()
+        version = importlib.metadata.version("rerun-sdk") if view is not None else ""
+        application = WebApplication(config.names, health, view, files, version)
+        presence = session.presence(SERVICE, instance=instance)
+        with (
+            _serving(application, config),
+            StationObserver(session) as observer,
+            HealthReporter(session, health),
+        ):
+            live = "" if view is not None else ", without the live view"
+            health.set_state(ServiceState.READY, f"http://{config.listen}{live}")
+            presence.ready()
+            looked_s = float("-inf")
+            while not stop.wait(_TURN_S):
+                beat()
+                if view is not None:
+                    for name, count in view.turn().items():
+                        health.count(name, count)
+                if time.monotonic() - looked_s >= _LOOK_S:
+                    looked_s = time.monotonic()
+                    plain = snapshot(
+                        station,
+                        observer.look(),
+                        router=session.has_router(),
+                        own=(SERVICE, instance),
+                    )
+                    plain["live"] = view is not None
+                    application.set_status(as_json(plain))
+            presence.not_ready()
+            health.set_state(ServiceState.STOPPING)
+
+
+def _has_rerun() -> bool:
+    try:
+        check_installed("rerun", extra="services")
+        check_installed("rerun_cli", extra="services")
+    except MissingExtraError as error:
+        _log.warning("there is no live view: %s; %s", error.problem, error.remedy)
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _serving(application: WebApplication, config: WebConfig) -> Iterator[None]:
+    """Serve in a thread while the block runs."""
+    from waitress.server import create_server
+
+    # Its remarks on queues of requests are about threads of ours, not about the station.
+    logging.getLogger("waitress.queue").setLevel(logging.ERROR)
+    host, port = endpoint_host_port(f"tcp/{config.listen}")
+    channels: dict[int, Any] = {}
+    try:
+        server = create_server(
+            application,
+            map=channels,
+            host=host,
+            port=port,
+            threads=_THREADS,
+            connection_limit=CONNECTIONS_MOST,
+            channel_timeout=IDLE_S,
+            cleanup_interval=5,
+            max_request_header_size=_HEADER_BYTES_MOST,
+            max_request_body_size=_HEADER_BYTES_MOST,
+            clear_untrusted_proxy_headers=True,
+            ident=None,
+        )
+    except (OSError, ValueError) as error:
+        raise LinkError(
+            f"the page cannot be served at {config.listen}: "
+            f"{getattr(error, 'strerror', None) or error}",
+            remedy="choose an address of this host and a free port: [web] listen in the profile",
+        ) from error
+    ended = threading.Event()
+
+    def serve() -> None:
+        while not ended.is_set():
+            server.asyncore.loop(timeout=_POLL_S, map=channels, use_poll=True, count=1)
+        server.task_dispatcher.shutdown()
+        server.asyncore.close_all(channels)
+
+    thread = threading.Thread(target=serve, name="web", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        server.pull_trigger()
+        thread.join(timeout=5.0)
