@@ -1,4 +1,4 @@
-"""Rerun's viewer for browsers, as files: they are inside Rerun's program, which serves them once."""
+"""The files of Rerun's viewer for browsers: they are inside its program, which serves them once."""
 
 from __future__ import annotations
 

@@ -33,6 +33,9 @@ CHAPTER_BYTES = 16_000_000
 """A chapter ends at this size [bytes]: half a minute of a moving skin, many minutes of one at rest.
 What is kept is at most two of them and the last part of each."""
 
+ANSWER_BYTES = 4_000_000
+"""Parts in one answer have at most this size together [bytes], unless one alone has more."""
+
 PERIOD_S = 0.5
 """Time between two parts [s]."""
 
@@ -48,8 +51,8 @@ class ViewPart:
     """What a viewer gets.
 
     Attributes:
-        place: Names this part in the next question.
-        data: A complete ``.rrd`` or ``.rbl``.
+        place: Names the end of this part in the next question.
+        data: A complete ``.rbl``, or one ``.rrd`` or more, one after another.
     """
 
     place: str
@@ -113,9 +116,16 @@ class KeptParts:
                 number = layouts = 0
             if layouts != self._layouts:
                 return ViewPart(self._place(number, self._layouts), self._layout)
+            # Parts in one answer are for viewers that take longer for an answer than for its parts.
+            several: list[bytes] = []
             for _, kept, data in self._parts:
                 if kept > number:
-                    return ViewPart(self._place(kept, layouts), data)
+                    if several and sum(map(len, several)) + len(data) > ANSWER_BYTES:
+                        break
+                    several.append(data)
+                    number = kept
+            if several:
+                return ViewPart(self._place(number, layouts), b"".join(several))
         return None
 
     def _place(self, number: int, layouts: int) -> str:
@@ -163,7 +173,7 @@ class WatchedView(Closing):
         return time.monotonic() - self._asked_s < UNWATCHED_S
 
     def turn(self) -> Counter[str]:
-        """Do what is due, for a fraction of a second at most; returns counts since the last call."""
+        """Do what is due, for a fraction of a second; returns what was counted since before."""
         if self.watched:
             self._draw()
         elif self._tap is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import logging
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -41,6 +42,7 @@ _HEADER_BYTES_MOST = 16_384
 _LOOK_S = 1.0
 _TURN_S = 0.05
 _POLL_S = 1.0
+_NICENESS = 5  # a page may wait, the hand may not
 
 
 def run_web(
@@ -58,6 +60,8 @@ def run_web(
         MissingExtraError: waitress is not installed.
     """
     require("waitress", extra="web")
+    with contextlib.suppress(OSError):  # a strict unit forbids it
+        os.nice(_NICENESS)
     health = Health(SERVICE, instance)
     with Session.open(link, station=station) as session, contextlib.ExitStack() as stack:
         view: Any = None

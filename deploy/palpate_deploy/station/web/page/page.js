@@ -3,6 +3,7 @@
 
 const PERIOD_MS = 1000;
 const PATIENCE_MS = 4000;
+const SHOWN = "#with-live-view";
 
 const COLOURS = {
   ready: "good", live: "good", routes: "good", running: "good",
@@ -160,7 +161,7 @@ function showLive(on) {
   }
 }
 
-at("live").addEventListener("click", () => { location.hash = location.hash === "#live" ? "" : "live"; });
-addEventListener("hashchange", () => showLive(location.hash === "#live"));
-showLive(location.hash === "#live");
+at("live").addEventListener("click", () => { location.hash = location.hash === SHOWN ? "" : SHOWN; });
+addEventListener("hashchange", () => showLive(location.hash === SHOWN));
+showLive(location.hash === SHOWN);
 ask();
