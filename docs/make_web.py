@@ -46,7 +46,6 @@ def main() -> None:
                 time.sleep(0.3)
                 picture = browser.picture()
     PICTURE.write_bytes(picture)
-    print(f"{PICTURE}: {len(picture)} bytes")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-
 from tests.deploy.browser import Browser, chromium
 from tests.deploy.web_station import TAB, WebStation, coloured, shades, web_station
 

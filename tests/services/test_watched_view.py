@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
 from palpate.bus import Session
 from palpate.bus.topics import ELECTRODES
 from palpate.config import LinkConfig
+from palpate.messages import ElectrodeFrame
 from palpate_services.viewer import watched_view
 from palpate_services.viewer.live_view import DrawnPart
 from palpate_services.viewer.watched_view import KeptParts, WatchedView
@@ -91,17 +91,17 @@ def test_a_place_that_is_none_is_the_beginning(place: str) -> None:
 def test_it_draws_while_watched_in_chapters_and_stops_afterwards(
     link: LinkConfig,
     monkeypatch: pytest.MonkeyPatch,
-    make_frame: Callable[..., object],
+    make_frame: Callable[..., ElectrodeFrame],
 ) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk not installed (extra services)")
-    monkeypatch.setattr(watched_view, "CHAPTER_BYTES", 20_000)
+    monkeypatch.setattr(watched_view, "CHAPTER_BYTES", 100_000)
     monkeypatch.setattr(watched_view, "_AGAIN_S", 0.5)
     with (
         Session.open(link) as session,
         WatchedView(session, title="lab") as view,
         session.publisher(ELECTRODES, sensor="finger") as publisher,
     ):
-        number = 0
+        number = 1
 
         def go_on(until: Callable[[], bool], what: str) -> None:
             nonlocal number
@@ -131,13 +131,12 @@ def test_it_draws_while_watched_in_chapters_and_stops_afterwards(
 
             return enough
 
-        go_on(more(120_000), "several chapters are drawn")
+        go_on(more(1_000_000), "several chapters are drawn")
         assert all(data.startswith(b"RRF2") for data in got)
         kept = sum(len(data) for data in read(view.parts)[1])
-        assert kept < sum(map(len, got))
-        layouts = [data for data in got if b"Blueprint" in data]
-        assert len(layouts) < 4  # not one for each chapter: it would move what the user has moved
+        assert kept < 0.8 * sum(map(len, got))
+        # Not a layout for each chapter: it would move what the user has moved.
+        assert place.split("-")[2] == "1"
         monkeypatch.setattr(watched_view, "UNWATCHED_S", 0.0)
         view.turn()
         assert read(view.parts, place)[1] == []
-        assert np.isfinite(kept)

@@ -56,7 +56,7 @@ def snapshot(
         "recordings": [_recording(one) for one in shown if one.report.service == RECORDER],
         "troubles": [asdict(one) for one in wrong[:PROCESSES_MOST]],
     }
-    return _finite(plain)
+    return {key: _finite(value) for key, value in plain.items()}
 
 
 def as_json(plain: dict[str, Any]) -> bytes:
