@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import gzip
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
-from palpate.bus import Session
+from palpate.bus import Publisher, Session
 from palpate.bus.topics import ELECTRODES
 from palpate.config import LinkConfig
 from palpate.messages import ElectrodeFrame
-from palpate_services.viewer import watched_view
+from palpate_services.viewer import viewer_files, watched_view
+from palpate_services.viewer.layout import MAX_SENSORS
 from palpate_services.viewer.live_view import DrawnPart
+from palpate_services.viewer.viewer_files import VIEWER_FILES, ViewerFiles
 from palpate_services.viewer.watched_view import KeptParts, WatchedView
 
 PATIENCE_S = 120.0
@@ -88,11 +93,42 @@ def test_a_place_that_is_none_is_the_beginning(place: str) -> None:
     assert read(parts, place)[1] == [b"L", b"a"]
 
 
-def test_it_draws_while_watched_in_chapters_and_stops_afterwards(
+class Watched:
+    """A view of a finger whose frames are published meanwhile, and what its viewer got."""
+
+    def __init__(
+        self,
+        view: WatchedView,
+        publisher: Publisher[ElectrodeFrame],
+        make_frame: Callable[..., ElectrodeFrame],
+    ) -> None:
+        self.view = view
+        self.got_bytes = 0
+        self.place = ""
+        self.counts: Counter[str] = Counter()
+        self._publisher, self._make_frame = publisher, make_frame
+        self._number = 0
+
+    def until(self, done: Callable[[], bool], what: str) -> None:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not done():
+            assert time.monotonic() < deadline_s, what
+            self._number += 1
+            self._publisher.put(self._make_frame(self._number))
+            self.counts += self.view.turn()
+            if (one := self.view.next_part(self.place)) is not None:
+                assert one.data.startswith(b"RRF2")
+                self.place = one.place
+                self.got_bytes += len(one.data)
+            time.sleep(0.02)
+
+
+@pytest.fixture
+def watched(
     link: LinkConfig,
     monkeypatch: pytest.MonkeyPatch,
     make_frame: Callable[..., ElectrodeFrame],
-) -> None:
+) -> Iterator[Watched]:
     pytest.importorskip("rerun", reason="rerun-sdk not installed (extra services)")
     monkeypatch.setattr(watched_view, "CHAPTER_BYTES", 100_000)
     monkeypatch.setattr(watched_view, "_AGAIN_S", 0.5)
@@ -101,42 +137,94 @@ def test_it_draws_while_watched_in_chapters_and_stops_afterwards(
         WatchedView(session, title="lab") as view,
         session.publisher(ELECTRODES, sensor="finger") as publisher,
     ):
-        number = 1
+        yield Watched(view, publisher, make_frame)
 
-        def go_on(until: Callable[[], bool], what: str) -> None:
-            nonlocal number
-            deadline_s = time.monotonic() + PATIENCE_S
-            while not until():
-                assert time.monotonic() < deadline_s, what
-                publisher.put(make_frame(number))
-                number += 1
-                counts = view.turn()
-                assert not counts["view_failed"]
-                assert not counts["view_rejected"]
-                time.sleep(0.02)
 
-        for _ in range(10):  # nobody watches
-            view.turn()
-        assert view.parts.after("") is None
-        got: list[bytes] = []
-        place = ""
+def test_it_draws_while_watched_in_chapters_and_stops_afterwards(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for _ in range(10):
+        watched.view.turn()
+    assert watched.view.parts.after("") is None  # nobody watches
+    watched.until(lambda: watched.got_bytes > 1_000_000, "several chapters are drawn")
+    assert not watched.counts["view_failed"]
+    assert not watched.counts["view_rejected"]
+    kept = sum(len(data) for data in read(watched.view.parts)[1])
+    assert kept < 0.8 * watched.got_bytes
+    # Not a layout for each chapter: it would move what the user has moved.
+    assert watched.place.split("-")[2] == "1"
+    monkeypatch.setattr(watched_view, "UNWATCHED_S", 0.0)
+    watched.view.turn()
+    assert read(watched.view.parts, watched.place)[1] == []
 
-        def more(least: int) -> Callable[[], bool]:
-            def enough() -> bool:
-                nonlocal place
-                if (one := view.next_part(place)) is not None:
-                    place = one.place
-                    got.append(one.data)
-                return sum(map(len, got)) > least
 
-            return enough
+def test_a_child_that_crashes_is_replaced(watched: Watched) -> None:
+    watched.until(lambda: watched.got_bytes > 0, "it draws")
+    child = watched.view._view
+    assert child is not None
+    assert child._process is not None
+    child._process.kill()
+    watched.until(lambda: watched.counts["view_failed"] > 0, "the crash is counted")
+    before = watched.got_bytes
+    watched.until(lambda: watched.got_bytes > before + 200_000, "another child goes on")
 
-        go_on(more(1_000_000), "several chapters are drawn")
-        assert all(data.startswith(b"RRF2") for data in got)
-        kept = sum(len(data) for data in read(view.parts)[1])
-        assert kept < 0.8 * sum(map(len, got))
-        # Not a layout for each chapter: it would move what the user has moved.
-        assert place.split("-")[2] == "1"
-        monkeypatch.setattr(watched_view, "UNWATCHED_S", 0.0)
-        view.turn()
-        assert read(view.parts, place)[1] == []
+
+def test_messages_that_break_the_contract_and_invented_sensors_are_left_out(
+    watched: Watched, make_frame: Callable[..., ElectrodeFrame]
+) -> None:
+    watched.until(lambda: watched.got_bytes > 0, "it draws")
+    session = watched.view._session
+    for number in range(3 * MAX_SENSORS):
+        with session.publisher(ELECTRODES, sensor=f"invented{number}") as stranger:
+            stranger.put_payload(b"\xff" * 40)
+            stranger.put(make_frame(1))
+    watched.until(
+        lambda: bool(watched.counts["view_rejected"] and watched.counts["view_no_room"]),
+        "they are counted",
+    )
+    before = watched.got_bytes
+    watched.until(lambda: watched.got_bytes > before + 200_000, "the finger is drawn as before")
+    assert not watched.counts["view_failed"]
+
+
+def test_the_files_of_the_viewer_come_out_of_the_installed_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rerun_cli", reason="rerun-sdk not installed (extra services)")
+    home = tmp_path / "home"
+    home.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")  # not asked for this host
+    files = viewer_files.fetch_viewer_files()
+    assert gzip.decompress(files["re_viewer_bg.wasm"])[:4] == b"\0asm"
+    assert b"WebHandle" in gzip.decompress(files["re_viewer.js"])
+    assert not list(home.iterdir())  # Rerun's settings and its id of this user: none
+
+
+def test_a_viewer_that_cannot_be_had_is_said_and_tried_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tries = []
+
+    def fetch() -> dict[str, bytes]:
+        tries.append(1)
+        if len(tries) == 1:
+            raise OSError("no room")
+        return dict.fromkeys(VIEWER_FILES, b"x")
+
+    monkeypatch.setattr(viewer_files, "fetch_viewer_files", fetch)
+    files = ViewerFiles()
+    found: dict[str, str] = {}
+
+    def come() -> bool:
+        found["problem"] = found.get("problem") or files.problem
+        return files.find("re_viewer.js") == b"x"
+
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not come():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+    assert "no room" in found["problem"]
+    with pytest.raises(KeyError):
+        files.find("../secret")

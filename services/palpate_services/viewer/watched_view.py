@@ -248,11 +248,9 @@ class WatchedView(Closing):
         sample = tap.next(0.0)
         if self._view is None:
             return
-        if sample.sensor not in self._sensors:
-            if len(self._sensors) >= MAX_SENSORS:
-                self._counts["view_no_room"] += 1
-                return
-            self._sensors.add(sample.sensor)
+        if sample.sensor not in self._sensors and len(self._sensors) >= MAX_SENSORS:
+            self._counts["view_no_room"] += 1
+            return
         stream = sample.sensor, sample.topic
         if sample.topic in _FIELDS:
             # Large, and the view leaves out most of them anyway.
@@ -268,6 +266,7 @@ class WatchedView(Closing):
         if message is None:
             self._counts["view_rejected"] += 1
             return
+        self._sensors.add(sample.sensor)
         if isinstance(message, Tare):
             self._told.add((sample.sensor, message.tare_id))
         elif isinstance(message, ElectrodeFrame):
