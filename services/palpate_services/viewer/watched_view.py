@@ -37,8 +37,8 @@ ANSWER_BYTES = 4_000_000
 """Parts in one answer have at most this size together [bytes], unless one alone has more."""
 
 PERIOD_S = 1.0
-"""Time between two parts [s]. Viewers take in a few pieces for each picture that they draw: at 0.5 s
-one without a graphics card falls behind for ever."""
+"""Time between two parts [s]. Viewers take in a few pieces for each picture that they draw: at
+0.5 s one without a graphics card falls behind for ever."""
 
 _AGAIN_S = 5.0
 _CLOSE_S = 2.0
