@@ -30,6 +30,11 @@ def plan(tmp_path: Path) -> ViewPlan:
     return ViewPlan(tmp_path / "view.rrd", "view", 1 << 30, ())
 
 
+def path_of(plan: ViewPlan) -> Path:
+    assert plan.path is not None
+    return plan.path
+
+
 @pytest.fixture
 def message(make_frame: Frames) -> Callable[[int], ViewMessage]:
     return lambda sequence: ViewMessage(
@@ -67,7 +72,7 @@ def drawn(plan: ViewPlan, first: ViewMessage, until: Until) -> Iterator[tuple[Li
     view = LiveView(plan)
     try:
         view.offer(first)
-        until(lambda: plan.path.exists() and plan.path.stat().st_size > 0)
+        until(lambda: path_of(plan).exists() and path_of(plan).stat().st_size > 0)
         (child,) = children_of(os.getpid())
         yield view, child
     finally:
@@ -88,7 +93,7 @@ def test_all_is_drawn_and_the_process_ends(
         view.finish()
         assert view.join(20.0)
         assert children_of(os.getpid()) == []
-        assert rows_of(plan.path) == 100
+        assert rows_of(path_of(plan)) == 100
         assert view.take_counts() == Counter()
 
 
@@ -157,12 +162,12 @@ def test_a_killed_recorder_leaves_a_whole_view(
         assert recorder.stdin is not None
         recorder.stdin.write(pickle.dumps((plan, [message(n) for n in range(1, 51)])))
         recorder.stdin.close()
-        until(lambda: plan.path.exists() and plan.path.stat().st_size > 0)
+        until(lambda: path_of(plan).exists() and path_of(plan).stat().st_size > 0)
         (child,) = children_of(recorder.pid)
         os.kill(child, signal.SIGTERM)  # as to a whole group; it ends by the recorder's end alone
         recorder.kill()
     until(lambda: not Path(f"/proc/{child}").exists() or b"draw_view" not in _command(child))
-    assert rows_of(plan.path) == 50
+    assert rows_of(path_of(plan)) == 50
 
 
 def _command(pid: int) -> bytes:
@@ -184,7 +189,7 @@ def test_messages_that_find_no_room_are_counted(
         view.offer(message(sequence)._replace(payload=first.payload))
     assert view.take_counts() == {"view_dropped": 15}
     view.close(20.0)
-    assert rows_of(plan.path) == 10
+    assert rows_of(path_of(plan)) == 10
 
 
 def test_a_bundle_that_is_gone_costs_the_view_alone(

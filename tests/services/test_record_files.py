@@ -293,6 +293,7 @@ def test_view_that_fails_leaves_the_record_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def crashed(plan: ViewPlan) -> LiveView:
+        assert plan.path is not None
         plan.path.mkdir()  # no file can be written there
         return LiveView(plan)
 
