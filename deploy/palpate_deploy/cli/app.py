@@ -74,7 +74,7 @@ def options(
     configure(log_level, log_format)
 
 
-@app.command(epilog=example("palpate up --profile virtual", "palpate up --print-config"))
+@app.command(epilog=example("palpate up --profile virtual", "palpate up --profile virtual --web"))
 def up(
     profile: ProfileOption = DEFAULT_PROFILE,
     print_config: Annotated[
