@@ -130,6 +130,20 @@ class TlsConfig(StrictConfig):
                 )
         return cls.model_validate(paths)
 
+    @classmethod
+    def of_role(cls, folder: Path, role: Role) -> TlsConfig:
+        """The certificates of a role: ``FOLDER/router/cert.pem`` and so on.
+
+        Or ``FOLDER/router_cert.pem``, as a unit of systemd hands them over (``palpate install``).
+
+        Raises:
+            ConfigError: One of them is missing.
+        """
+        flat = {key: folder / f"{role.value}_{name}" for key, name in TLS_FILES.items()}
+        if all(path.is_file() for path in flat.values()):
+            return cls.model_validate(flat)
+        return cls.of_folder(folder / role.value)
+
 
 class RouterOptions(StrictConfig):
     """A router that may be another than one's own.
@@ -254,7 +268,7 @@ class LinkConfig(StrictConfig):
         """
         if self.certificates is None:
             return self
-        tls = TlsConfig.of_folder(self.certificates.expanduser() / role.value)
+        tls = TlsConfig.of_role(self.certificates.expanduser(), role)
         return self.model_copy(update={"tls": tls, "certificates": None})
 
 

@@ -30,7 +30,7 @@ from tests.install.scores import scores
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "docs" / "results" / "install.json"
-EXTRAS = "gateway,services,fem,metrics"
+EXTRAS = "gateway,services,fem,metrics,web"
 PACKAGES = ("python3", "python3-venv")
 
 

@@ -106,10 +106,12 @@ def test_quadlets_say_the_same_as_compose(case: str) -> None:
 
 
 def test_certificates_are_not_put_into_files() -> None:
-    tls = {"root_ca_certificate": "a", "certificate": "b", "private_key": "c"}
     plan = plan_of_case("virtual")
-    profile = parse_profile({"link": {"tls": tls}}, where="test")
-    with pytest.raises(ConfigError, match=r"\[link.tls\]"):
+    profile = parse_profile(
+        {"link": {"certificates": "/pki"}, "router": {"listen": ["tls/127.0.0.1:7447"]}},
+        where="test",
+    )
+    with pytest.raises(ConfigError, match="certificates in containers"):
         container_files(type(plan)("lab", profile, plan.needs, plan.program), "", VERSION)
 
 

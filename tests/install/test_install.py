@@ -13,6 +13,7 @@ from tests.install.cases import PROFILES, VIRTUAL
 from tests.install.conftest import PROGRAM, Install
 from tests.install.image import contents, difference
 
+from palpate.config import Role, TlsConfig
 from palpate.errors import ConfigError, LinkError, MissingExtraError
 from palpate_deploy.install import service
 from palpate_deploy.install.ledger import InstallError
@@ -402,10 +403,37 @@ def test_router_for_other_hosts_needs_to_know_which(
         install(tmp_path / "lab.toml", allowed=("everyone",))
 
 
+def test_certificates_by_role_are_handed_over_by_systemd(
+    root: Path, tmp_path: Path, install: Install
+) -> None:
+    (tmp_path / "lab.toml").write_text(
+        '[router]\nlisten = ["tls/127.0.0.1:7447"]\n[link]\ncertificates = "/pki"\n'
+    )
+    install(tmp_path / "lab.toml")
+    unit = (root / UNIT).read_text("utf-8")
+    handed = dict(
+        line.removeprefix("LoadCredential=").split(":")
+        for line in unit.splitlines()
+        if line.startswith("LoadCredential=")
+    )
+    assert {name.partition("_")[0] for name in handed} == {"router", "gateway", "service"}
+    assert "Environment=PALPATE_LINK__CERTIFICATES=%d" in unit
+    credentials = tmp_path / "credentials"  # as systemd lays them out
+    credentials.mkdir()
+    for name in handed:
+        (credentials / name).write_text("")
+    for role in (Role.ROUTER, Role.GATEWAY, Role.SERVICE):
+        tls = TlsConfig.of_role(credentials, role)
+        assert handed[tls.private_key.name] == f"/pki/{role}/key.pem"
+    with pytest.raises(ConfigError, match="operator"):
+        TlsConfig.of_role(credentials, Role.OPERATOR)
+
+
 def test_certificate_that_is_not_there_is_named(
     root: Path, tmp_path: Path, install: Install, this_host: Path
 ) -> None:
     (tmp_path / "lab.toml").write_text(
+        '[router]\nlisten = ["tls/127.0.0.1:7447"]\n'
         f'[link.tls]\nroot_ca_certificate = "{tmp_path}/ca.pem"\n'
         f'certificate = "{tmp_path}/lab.toml"\nprivate_key = "{tmp_path}/lab.toml"\n'
     )

@@ -86,9 +86,9 @@ def container_files(plan: ServicePlan, profile: str, version: str) -> dict[str, 
     Raises:
         ConfigError: The profile has certificates.
     """
-    if plan.profile.link.tls is not None:
+    if plan.profile.link.has_tls:
         raise ConfigError(
-            "[link.tls]: certificates in containers are secrets of the engine",
+            "[link]: certificates in containers are secrets of the engine",
             remedy="install it as a service, or write these files from a profile without them",
         )
     image = f"palpate:{version}"

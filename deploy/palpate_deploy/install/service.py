@@ -12,6 +12,7 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
+from palpate.config import TLS_FILES, TlsConfig
 from palpate.errors import ConfigError, PalpateError
 from palpate_deploy.install.ledger import (
     Books,
@@ -35,6 +36,7 @@ from palpate_deploy.install.units import (
     UNITS_FOLDER,
     ServicePlan,
     profile_path,
+    roles_of,
 )
 from palpate_deploy.station import profile as profiles
 from palpate_deploy.station.host import check_free
@@ -192,7 +194,11 @@ def _check_this_host(profile: profiles.Profile, *, first: bool) -> None:
     """Check what the units would fail on at once: a port in use, a certificate that is missing."""
     if first and "router" in profile.processes:
         check_free(profile.router.listen)
-    for path in () if profile.link.tls is None else profile.link.tls.model_dump().values():
+    if profile.link.certificates is not None:
+        for role in roles_of(profile):
+            TlsConfig.of_folder(profile.link.certificates / role)
+    for key in () if profile.link.tls is None else TLS_FILES:
+        path = getattr(profile.link.tls, key)
         if not path.is_file():
             raise ConfigError(f"{path} does not exist", remedy="set [link.tls]")
 

@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from palpate.config import TLS_FILES
+from palpate.config import TLS_FILES, Role
 from palpate_deploy.install.needs import HostNeeds
+from palpate_deploy.station.processes import role_of
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.supervision import STOP_WAIT_S
 
@@ -148,7 +149,7 @@ def _station_unit(plan: ServicePlan) -> str:
             "StateDirectoryMode=0700",
             f"WorkingDirectory={state}",
             *environment,
-            *_credentials(plan.profile),
+            *_credentials(plan.profile, roles_of(plan.profile)),
         ],
         [
             "MemoryDenyWriteExecute=yes",
@@ -189,7 +190,7 @@ def _solver_unit(plan: ServicePlan) -> str:
             "CacheDirectoryMode=0700",
             "WorkingDirectory=/tmp",
             f"Environment=HOME=/tmp XDG_CACHE_HOME={CACHES_FOLDER / name} MPLCONFIGDIR=/tmp",
-            *_credentials(plan.profile),
+            *_credentials(plan.profile, [Role.SERVICE]),
         ],
         [
             "# No MemoryDenyWriteExecute: Warp compiles its kernels into memory.",
@@ -229,14 +230,29 @@ def _unit(
     return "\n".join(lines) + "\n"
 
 
-def _credentials(profile: Profile) -> list[str]:
+def roles_of(profile: Profile) -> tuple[Role, ...]:
+    """Roles that the processes of a station have."""
+    return tuple(dict.fromkeys([*map(role_of, profile.processes), Role.SERVICE]))
+
+
+def _credentials(profile: Profile, roles: Sequence[Role]) -> list[str]:
     """Certificates for a user that may not read them: systemd reads them and hands them over."""
-    if profile.link.tls is None:
+    link = profile.link
+    if link.certificates is not None:
+        return [
+            *(
+                f"LoadCredential={role}_{name}:{link.certificates / role / name}"
+                for role in roles
+                for name in TLS_FILES.values()
+            ),
+            "Environment=PALPATE_LINK__CERTIFICATES=%d",
+        ]
+    if link.tls is None:
         return []
-    files = profile.link.tls.model_dump(mode="json")
+    paths = {key: getattr(link.tls, key) for key in TLS_FILES}
     return [
-        *(f"LoadCredential={TLS_FILES[key]}:{path}" for key, path in files.items()),
-        *(f"Environment=PALPATE_LINK__TLS__{key.upper()}=%d/{TLS_FILES[key]}" for key in files),
+        *(f"LoadCredential={TLS_FILES[key]}:{path}" for key, path in paths.items()),
+        *(f"Environment=PALPATE_LINK__TLS__{key.upper()}=%d/{TLS_FILES[key]}" for key in paths),
     ]
 
 

@@ -101,7 +101,7 @@ class ForceProcesses(nn.Module):
     def __init__(self, rows: KnownRows, rest: Floats, *, local: float) -> None:
         super().__init__()
         self.line = ForceLine(rows)
-        self.twin = _MappedLine(read_line(), rows, rest)
+        self.twin = _OwnLine(read_line(), rows, rest)
         with torch.inference_mode():
             known = self.twin(torch.from_numpy(rows.tared)).numpy()
         left = KnownRows(rows.tared, rows.force - known, rows.press)
@@ -123,7 +123,7 @@ class ForceProcesses(nn.Module):
         return force.float()
 
 
-class _MappedLine(nn.Module):
+class _OwnLine(nn.Module):
     """A line through the twin, mapped to a finger by rows of it."""
 
     rest: Tensor
