@@ -345,7 +345,9 @@ def answered(*answers: bytes) -> tuple[str, int | None]:
     """Run the command in a terminal, and type; ``0`` stands for the last choice of a question."""
     pid, terminal = pty.fork()
     if pid == 0:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a test run in the background ignores it
+        # A test run in the background ignores it, and a test before this one may have blocked it.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         os.execv(NEW_STATION[0], NEW_STATION)
     said, left, answered_to = b"", list(answers), 0
     while True:

@@ -278,7 +278,7 @@ def test_what_the_only_device_had_last_is_not_forgotten() -> None:
     [("DIES", "exit status 7, again"), ("STUBBORN", "silent"), ("DEFECTIVE", "a defect")],
 )
 def test_a_solver_that_dies_again_ends_the_batch(kind: str, said: str) -> None:
-    batch = batch_of(getattr(fakes, kind), start_s=2.0, hang_s=2.0)
+    batch = batch_of(getattr(fakes, kind), start_s=20.0, hang_s=2.0 if kind == "STUBBORN" else 20.0)
     with pytest.raises(RemoteError, match=said):
         run(batch, sweeps.plans(2))
 
