@@ -11,8 +11,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
+
+from palpate.process import Closing
 
 FLAGS = (
     "--headless=new",
@@ -43,7 +44,7 @@ def chromium() -> str | None:
     return shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 
 
-class Browser:
+class Browser(Closing):
     """One tab. ``console`` are the lines that its pages have written, warnings and errors only.
 
     Args:
@@ -157,14 +158,3 @@ class Browser:
             os.killpg(self._process.pid, 9)
             self._process.wait()
         os.close(self._in)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()

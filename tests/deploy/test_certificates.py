@@ -8,7 +8,6 @@ import re
 import shutil
 import ssl
 import stat
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +18,9 @@ from typer.testing import CliRunner
 
 pytest.importorskip("cryptography")
 
-from palpate.bus import Session, run_router
+from tests.lab_router import router_of
+
+from palpate.bus import Session
 from palpate.config import LinkConfig, Role, TlsConfig
 from palpate.errors import ConfigError
 from palpate_deploy.cli.app import app
@@ -193,27 +194,16 @@ def test_a_link_ends_with_the_certificate_that_opened_it(
         issue(lab, Role.ROBOT, days=1)
     endpoint = f"tls/127.0.0.1:{new_port()}"
     link = LinkConfig(connect=(endpoint,), certificates=lab, wait_for_router_s=60, direct=False)
-    stop = threading.Event()
-    router = threading.Thread(
-        target=run_router,
-        args=((endpoint,), stop),
-        kwargs={"link": link.as_role(Role.ROUTER)},
-        daemon=True,
-    )
-    router.start()
-    try:
-        with (
-            Session.open(link.as_role(Role.SERVICE)) as service,
-            Session.open(link.as_role(Role.ROBOT)) as robot,
-        ):
-            deadline = time.monotonic() + 60
-            while robot.has_router():
-                assert time.monotonic() < deadline, "the link outlives its certificate"
-                time.sleep(0.1)
-            assert service.has_router(), "another link has ended, too"
-    finally:
-        stop.set()
-        router.join(60)
+    with (
+        router_of(link, patience_s=60),
+        Session.open(link.as_role(Role.SERVICE)) as service,
+        Session.open(link.as_role(Role.ROBOT)) as robot,
+    ):
+        deadline = time.monotonic() + 60
+        while robot.has_router():
+            assert time.monotonic() < deadline, "the link outlives its certificate"
+            time.sleep(0.1)
+        assert service.has_router(), "another link has ended, too"
 
 
 def test_the_profiles_on_the_page_are_right(lab: Path, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,8 +13,10 @@ from typer.testing import CliRunner
 
 pytest.importorskip("cryptography")
 
+from tests.lab_router import make_certificates, router_of
+
 from palpate import Client
-from palpate.bus import Session, run_router
+from palpate.bus import Session
 from palpate.config import LinkConfig, Role, endpoint_host_port, is_loopback
 from palpate.errors import ConfigError, LinkError
 from palpate.health import Health, HealthReporter
@@ -28,35 +29,22 @@ LIVE_S = 20.0
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a lab with a certificate for each role."""
-    folder = tmp_path_factory.mktemp("tls") / "lab"
-    make_authority(folder)
-    for role in Role:
-        issue(folder, role)
-    return folder
+    return make_certificates(tmp_path_factory.mktemp("tls") / "lab")
 
 
 @pytest.fixture(scope="module")
 def station(certificates: Path, new_port: Callable[[], int]) -> Iterator[str]:
     """A router with mutual TLS and one process behind it: its endpoint."""
     endpoint = f"tls/127.0.0.1:{new_port()}"
-    stop = threading.Event()
     link = LinkConfig(connect=(endpoint,), certificates=certificates, wait_for_router_s=LIVE_S)
-    router = threading.Thread(
-        target=run_router,
-        args=((endpoint,), stop),
-        kwargs={"link": link.as_role(Role.ROUTER)},
-        daemon=True,
-    )
-    router.start()
     with (
+        router_of(link, patience_s=LIVE_S),
         Session.open(link.as_role(Role.SERVICE)) as session,
         HealthReporter(session, Health("features", "features")),
         session.presence("features", instance="features") as presence,
     ):
         presence.ready()
         yield endpoint
-    stop.set()
-    router.join(LIVE_S)
 
 
 def test_a_client_joins_with_its_certificates_only(

@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
+from tests.lab_router import make_certificates
 
 from palpate.admin import read_token, token_file
 from palpate.bus import Session
-from palpate.config import LinkConfig, Role, TlsConfig
+from palpate.config import LinkConfig, TlsConfig
 from palpate.files.signature import make_signing_key
 from palpate.messages import Status
 from palpate.process import Closing
-from palpate_deploy.station.certificates import issue, make_authority
 from palpate_deploy.station.host import free_endpoint
 
 LIVE_S = 60.0
@@ -61,10 +61,7 @@ class Lab(Closing):
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.certificates = folder / "certs"
-        make_authority(self.certificates)
-        for role in Role:
-            issue(self.certificates, role)
+        self.certificates = make_certificates(folder / "certs")
         self.key = folder / "lab.key"
         make_signing_key(self.key)
         self.endpoint = free_endpoint().replace("tcp/", "tls/")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import threading
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,13 +12,14 @@ import zenoh
 
 pytest.importorskip("cryptography")
 
-from palpate.bus import Session, run_router
+from tests.lab_router import make_certificates, router_of
+
+from palpate.bus import Session
 from palpate.bus.access import PUBLISHERS, QUESTIONS, Deed, rights
 from palpate.bus.endpoints import ENDPOINTS
 from palpate.bus.topics import TOPICS, sensor_key, service_key
 from palpate.config import LinkConfig, Role, RouterOptions, TlsConfig
 from palpate.errors import ConfigError
-from palpate_deploy.station.certificates import issue, make_authority
 
 LIVE_S = 30.0
 QUIET_S = 1.0
@@ -79,11 +80,7 @@ def test_only_operators_and_services_reach_what_changes_a_station() -> None:
 
 @pytest.fixture(scope="module")
 def authority(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("lab") / "certs"
-    make_authority(folder)
-    for role in Role:
-        issue(folder, role)
-    return folder
+    return make_certificates(tmp_path_factory.mktemp("lab") / "certs")
 
 
 @pytest.fixture(scope="module", params=["direct", "through the router"])
@@ -96,26 +93,17 @@ def lab(
     link = LinkConfig(
         connect=(endpoint,), certificates=authority, direct=direct, wait_for_router_s=LIVE_S
     )
-    stop = threading.Event()
-    router = threading.Thread(
-        target=run_router,
-        args=((endpoint,), stop),
-        kwargs={"link": link.as_role(Role.ROUTER)},
-        daemon=True,
-    )
-    router.start()
-    sessions = {role: Session.open(link.as_role(role)) for role in HOLDERS}
-    raw = {role: session._raw for role, session in sessions.items()}
-    others = len(HOLDERS) - 1 if direct else 0
-    deadline = time.monotonic() + LIVE_S
-    while any(len(one.info.peers_zid()) < others for one in raw.values()):
-        assert time.monotonic() < deadline, "the direct links do not come up"
-        time.sleep(0.05)
-    yield raw
-    for session in sessions.values():
-        session.close()
-    stop.set()
-    router.join(LIVE_S)
+    with contextlib.ExitStack() as opened:
+        opened.enter_context(router_of(link, patience_s=LIVE_S))
+        raw = {
+            role: opened.enter_context(Session.open(link.as_role(role)))._raw for role in HOLDERS
+        }
+        others = len(HOLDERS) - 1 if direct else 0
+        deadline = time.monotonic() + LIVE_S
+        while any(len(one.info.peers_zid()) < others for one in raw.values()):
+            assert time.monotonic() < deadline, "the direct links do not come up"
+            time.sleep(0.05)
+        yield raw
 
 
 def _heard(lab: Lab, key: str) -> dict[Role, set[Role]]:

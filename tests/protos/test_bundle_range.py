@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.protos.changed_manifest import change
 
 from palpate.errors import BundleError
 from palpate.files.bundle import MANIFEST, Manifest, read_bundle, write_bundle
@@ -105,12 +106,7 @@ def test_a_range_that_is_none(
     tmp_path: Path, where: tuple[Any, ...], value: object, problem: str
 ) -> None:
     folder = _write(tmp_path / "1", training_range=RANGE)
-    values: Any = json.loads((folder / MANIFEST).read_text())
-    inside = values["training_range"]
-    for key in where[:-1]:
-        inside = inside[key]
-    inside[where[-1]] = value
-    (folder / MANIFEST).write_text(json.dumps(values))
+    change(folder, ("training_range", *where), value)
     with pytest.raises(BundleError) as caught:
         read_bundle(folder)
     assert problem in str(caught.value)

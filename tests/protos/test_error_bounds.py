@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.protos.changed_manifest import change
 
 from palpate import codec
 from palpate.errors import BundleError, WireError
@@ -228,12 +229,7 @@ def test_intervals_that_are_none(
     tmp_path: Path, where: tuple[Any, ...], value: object, problem: str
 ) -> None:
     folder = _write(tmp_path / "1", intervals=INTERVALS)
-    values: Any = json.loads((folder / MANIFEST).read_text())
-    inside = values["intervals"]
-    for key in where[:-1]:
-        inside = inside[key]
-    inside[where[-1]] = value
-    (folder / MANIFEST).write_text(json.dumps(values))
+    change(folder, ("intervals", *where), value)
     with pytest.raises(BundleError) as caught:
         read_bundle(folder)
     assert problem in str(caught.value)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from palpate_training.learning.electrode_nets import MIRROR_AXES, log_impedance
+from palpate_training.learning.electrode_nets import log_impedance
 from palpate_training.learning.twin_line import TwinLine, read_line
 
 Floats = npt.NDArray[np.float64]
@@ -138,12 +138,8 @@ class _OwnLine(nn.Module):
         self.register_buffer("log_rest", log_impedance(self.rest))
         with torch.inference_mode():
             guess = self(torch.from_numpy(rows.tared)).numpy()
-        guess, force = (np.vstack([one, one * MIRROR_AXES]) for one in (guess, rows.force))
-        factor = np.sum(guess * force) / np.sum(guess * guess)
-        gram = guess.T @ guess + MAP_PENALTY_N2 * len(guess) * np.eye(3)
-        to_own = factor * np.eye(3) + np.linalg.solve(gram, guess.T @ (force - factor * guess))
-        self.weight = torch.from_numpy(line.weight @ to_own)
-        self.offset = torch.from_numpy(line.offset @ to_own)
+        own = line.mapped(guess, rows.force, penalty_n2=MAP_PENALTY_N2)
+        self.weight, self.offset = torch.from_numpy(own.weight), torch.from_numpy(own.offset)
 
     def forward(self, tared: Tensor) -> Tensor:
         """Forces [N], shape (N, 3), double."""

@@ -12,7 +12,7 @@ it serves as what is believed before a finger's own rows are seen.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,20 @@ class TwinLine:
     def force(self, electrodes: npt.NDArray[Any], rest: npt.NDArray[Any]) -> Floats:
         """Forces [N] of raw and untouched counts (N, 19), shape (N, 3)."""
         return np.asarray(_inputs(electrodes, rest) @ self.weight + self.offset)
+
+    def mapped(self, guess: Floats, force: Floats, *, penalty_n2: float = 0.0) -> TwinLine:
+        """The line of a real finger, which differs in scale and in how the finger sits.
+
+        Args:
+            guess: What this line says of some rows [N], shape (N, 3).
+            force: What was measured there.
+            penalty_n2: Of a linear map that is more than one factor [N^2].
+        """
+        rows, wanted = (np.vstack([one, one * MIRROR_AXES]) for one in (guess, force))
+        factor = np.sum(rows * wanted) / np.sum(rows * rows)
+        gram = rows.T @ rows + penalty_n2 * len(rows) * np.eye(3)
+        to_real = factor * np.eye(3) + np.linalg.solve(gram, rows.T @ (wanted - factor * rows))
+        return replace(self, weight=self.weight @ to_real, offset=self.offset @ to_real)
 
 
 def fit_line(data: FeatureDataset) -> TwinLine:

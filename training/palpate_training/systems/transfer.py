@@ -205,29 +205,14 @@ class _Scale:
         return np.asarray(weight * (parts - self.centre) / self.spread)
 
 
-class _MappedLine:
-    """A line through the twin, and the linear map that takes its forces to those of real fingers.
+def _mapped(line: TwinLine, sources: Sequence[FingerRecording]) -> TwinLine:
+    """A line through the twin, mapped to real fingers: they differ from it alike."""
+    guess = np.vstack([_said(line, source) for source in sources])
+    return line.mapped(guess, np.vstack([source.force for source in sources]))
 
-    Twin and real fingers differ alike for all fingers: in scale, and in how a finger sits.
-    """
 
-    def __init__(self, line: TwinLine, sources: Sequence[FingerRecording]) -> None:
-        """Fit the map to recordings and their mirror images."""
-        self._line = line
-        guess, force = (
-            np.vstack([*parts, *(part * MIRROR_AXES for part in parts)])
-            for parts in (
-                [line.force(source.electrodes, source.baseline) for source in sources],
-                [source.force for source in sources],
-            )
-        )
-        self._to_real = np.linalg.lstsq(guess, force, rcond=None)[0]
-
-    def __call__(self, recording: FingerRecording) -> Floats:
-        """Forces of all rows [N], shape (N, 3)."""
-        return np.asarray(
-            self._line.force(recording.electrodes, recording.baseline) @ self._to_real
-        )
+def _said(line: TwinLine, recording: FingerRecording) -> Floats:
+    return line.force(recording.electrodes, recording.baseline)
 
 
 class _Process:
@@ -239,7 +224,7 @@ class _Process:
         inputs: Inputs,
         kernel: Kernel,
         *,
-        prior: _MappedLine | None = None,
+        prior: TwinLine | None = None,
         aligned: bool = False,
     ) -> None:
         self._inputs, self._kernel, self._aligned = inputs, kernel, aligned
@@ -251,7 +236,7 @@ class _Process:
             some = np.unique(some)
             for one in (source, source.mirrored()):
                 rows.append(self._scale_of(one).apply(one, inputs, some))
-                known = 0.0 if prior is None else prior(one)[some]
+                known = 0.0 if prior is None else _said(prior, one)[some]
                 targets.append(one.force[some] - known)
         self._rows = np.vstack(rows)
         force = np.vstack(targets)
@@ -269,7 +254,7 @@ class _Process:
         rows = self._scale_of(recording).apply(recording, self._inputs, everything)
         parts = np.array_split(rows, max(1, len(rows) // 4000))
         learned = np.vstack([self._kernel(part, self._rows) @ self._weight for part in parts])
-        known = 0.0 if self._prior is None else self._prior(recording)
+        known = 0.0 if self._prior is None else _said(self._prior, recording)
         return np.asarray(self._unit * learned + known)
 
 
@@ -298,7 +283,7 @@ class ForceTransfer:
         """
         self._sources = sources
         self._scale = _Scale.shared(sources, CORRECTION_INPUTS)
-        prior = None if line is None else _MappedLine(line, sources)
+        prior = None if line is None else _mapped(line, sources)
         self._magnitude = [_Process(sources, *each, prior=prior) for each in MAGNITUDE]
         self._direction = [_Process(sources, *each) for each in DIRECTION]
 
