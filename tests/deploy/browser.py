@@ -50,7 +50,8 @@ class Browser(Closing):
     Args:
         program: Path of Chromium.
         profile: A folder for its own files.
-        size: Width and height of the tab [pixels].
+        size: Width and height of the tab [CSS pixels].
+        scale: Pixels of a picture for each of them; software draws four times as fast with 0.5.
         timeout_s: How long one answer of the browser may take [s].
     """
 
@@ -60,6 +61,7 @@ class Browser(Closing):
         profile: Path,
         *,
         size: tuple[int, int] = (1400, 1000),
+        scale: float = 1.0,
         timeout_s: float = 120.0,
     ) -> None:
         self.console: list[str] = []
@@ -86,7 +88,7 @@ class Browser(Closing):
             self.call(f"{domain}.enable")
         self.call(
             "Emulation.setDeviceMetricsOverride",
-            width=size[0], height=size[1], deviceScaleFactor=1, mobile=False,
+            width=size[0], height=size[1], deviceScaleFactor=scale, mobile=False,
         )  # fmt: skip
 
     def open(self, address: str) -> None:

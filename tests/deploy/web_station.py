@@ -20,10 +20,10 @@ from palpate_deploy.station.host import free_endpoint
 
 STOP_S = 90.0
 
-SKIN = (slice(70, 420), slice(1010, 1490))
-"""Where the live view alone shows the estimated skin, in a tab of ``TAB``."""
-
 TAB = (1500, 1150)
+
+SKIN = ((70, 420), (1010, 1490))
+"""Rows and columns where the live view alone shows the estimated skin, in a tab of ``TAB``."""
 
 _PROFILE = """
 station = "lab"
@@ -82,11 +82,18 @@ def web_station(folder: Path) -> Iterator[WebStation]:
 
 def coloured(picture: bytes) -> float:
     """Share of the pixels of the estimated skin's picture that have a colour, not a grey."""
-    pixels: npt.NDArray[np.float32] = image.imread(io.BytesIO(picture))[..., :3][SKIN]
+    pixels = _skin_of(picture)
     return float(np.mean(pixels.max(axis=2) - pixels.min(axis=2) > 0.25))
 
 
 def shades(picture: bytes) -> int:
     """How many different colours the estimated skin's picture has."""
-    pixels = (255 * image.imread(io.BytesIO(picture))[..., :3][SKIN]).astype(np.uint8)
-    return len(np.unique(pixels.reshape(-1, 3), axis=0))
+    return len(np.unique((255 * _skin_of(picture)).astype(np.uint8).reshape(-1, 3), axis=0))
+
+
+def _skin_of(picture: bytes) -> npt.NDArray[np.float32]:
+    """The estimated skin in a picture of a tab of ``TAB``, whatever its scale."""
+    pixels: npt.NDArray[np.float32] = image.imread(io.BytesIO(picture))[..., :3]
+    scale = pixels.shape[1] / TAB[0]
+    rows, columns = (slice(*(round(scale * end) for end in ends)) for ends in SKIN)
+    return pixels[rows, columns]

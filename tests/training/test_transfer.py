@@ -104,6 +104,21 @@ def test_a_common_offset_changes_nothing(
         assert np.abs(moved).max() < 0.1 + (0.2 if unlabelled else 0.0)
 
 
+def test_a_press_corrects_most_what_comes_just_before_and_after_it(model: ForceTransfer) -> None:
+    """Baselines wander within half a minute, but not from one recording to the next."""
+    whole = replace(finger(2).recording, period_s=0.1)
+    estimate = whole.force - np.array([0.0, 0.0, 0.5])
+    rows = np.arange(800, 820)
+    labelled = LabelledPresses(rows, np.zeros(20, np.int64))
+    by = np.linalg.norm(model.correct(whole, estimate, labelled).force - estimate, axis=1)
+    near, far = np.r_[760:790, 830:860], np.r_[0:300, 1300:1600]
+    assert by[near].mean() > 2.0 * by[far].mean()
+    ended = replace(whole, segment=(np.arange(ROWS) >= 825).astype(np.int64))
+    after = np.linalg.norm(model.correct(ended, estimate, labelled).force - estimate, axis=1)
+    assert after[830:860].mean() < 0.85 * by[830:860].mean()
+    np.testing.assert_allclose(after[760:790], by[760:790])
+
+
 def test_without_labels_a_row_depends_on_the_tare_and_the_rows_before_it_only(
     model: ForceTransfer,
 ) -> None:

@@ -9,7 +9,8 @@ over a few such processes, none of them chosen alone.
 
 From a finger's electrodes *without* forces comes more about the direction: a recording's mean and
 spread, electrode by electrode, take the place of the other fingers'. From a few *labelled* presses
-comes a correction that reaches as far as what was pressed, by the common mode, too.
+comes a correction that reaches as far as what was pressed, by the common mode, too, and of all that
+lies some seconds before and after them, as baselines wander.
 
 The magnitude's processes start from a line through the presses of a simulated population, mapped to
 real fingers by what was learned on the others (``TwinLine``); what they learn is what that line
@@ -107,8 +108,12 @@ CORRECTION_VARIANCE_N2 = 0.3
 OFFSET_VARIANCE_N2 = 0.01
 """Of the error's share that is the same everywhere."""
 
+WANDERING_N2, WANDERING_S = 0.1, 10.0
+"""Variance of the error's share that wanders with the baselines, wherever the finger is pressed,
+and the time over which it does [s]."""
+
 PRESS_VARIANCE_N2 = 0.02
-"""Of what the rows of one press share and another press does not: a baseline that wanders."""
+"""Of what the rows of one press share and those before and after it do not."""
 
 ROW_VARIANCE_N2 = 0.01
 
@@ -322,18 +327,22 @@ class ForceTransfer:
         known = rows[labelled.rows]
         error = recording.force[labelled.rows] - estimate[labelled.rows]
 
-        def covariance(a: Floats, b: Floats) -> Floats:
-            return OFFSET_VARIANCE_N2 + CORRECTION_VARIANCE_N2 * CORRECTION(a, b)
+        def covariance(some: npt.NDArray[np.integer]) -> Floats:
+            place = CORRECTION_VARIANCE_N2 * CORRECTION(rows[some], known)
+            apart_s = recording.period_s * np.abs(some[:, None] - labelled.rows)
+            together = recording.segment[some][:, None] == recording.segment[labelled.rows]
+            moment = WANDERING_N2 * together * np.exp(-apart_s / WANDERING_S)
+            return OFFSET_VARIANCE_N2 + place + moment
 
         same = labelled.press[:, None] == labelled.press
         inverse = np.linalg.inv(
-            covariance(known, known)
+            covariance(labelled.rows)
             + PRESS_VARIANCE_N2 * same
             + ROW_VARIANCE_N2 * np.eye(len(same))
         )
         weight = inverse @ error
-        parts = np.array_split(rows, max(1, len(rows) // 4000))
-        force = estimate + np.vstack([covariance(part, known) @ weight for part in parts])
+        parts = np.array_split(everything, max(1, len(rows) // 4000))
+        force = estimate + np.vstack([covariance(part) @ weight for part in parts])
         # What is left of a press when it is left out follows from the inverse alone.
         held_out = np.empty_like(error)
         for press in np.unique(labelled.press):
