@@ -21,7 +21,7 @@ from palpate.errors import (
     DeviceTimeout,
     LinkError,
     PalpateError,
-    SensorTaken,
+    ClaimedElsewhere,
 )
 from palpate.health import Health
 from palpate.heartbeat import Turns
@@ -267,7 +267,7 @@ class SensorWorker:
                 self._calm_s, self._delivered = self._calm(), False
                 if self._pump():
                     return
-            except SensorTaken as error:
+            except ClaimedElsewhere as error:
                 if not self.device.info.live:
                     raise
                 self.serving = self.silent = False
