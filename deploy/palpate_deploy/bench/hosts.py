@@ -151,7 +151,7 @@ def namespaces() -> list[str]:
 
 
 def remove_leftovers() -> list[str]:
-    """Remove namespaces whose process is gone, with what still runs in them; returns their names."""
+    """Remove namespaces whose process is gone, and what runs in them; returns their names."""
     gone = []
     for namespace in namespaces():
         pid = namespace.removeprefix(f"{PREFIX}-").partition("-")[0]

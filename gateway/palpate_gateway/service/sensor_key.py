@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from palpate.bus import SensorClaims
-from palpate.errors import ConfigError, ClaimedElsewhere
+from palpate.errors import ClaimedElsewhere, ConfigError
 from palpate_gateway.config import SensorConfig
 
 _POLL_S = 0.1

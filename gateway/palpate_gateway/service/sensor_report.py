@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 
-from palpate.errors import DeviceError, DeviceTimeout, PalpateError, ClaimedElsewhere
+from palpate.errors import ClaimedElsewhere, DeviceError, DeviceTimeout, PalpateError
 from palpate.health import Health
 from palpate.log import about
 from palpate.messages import ChannelFault, FaultKind, SensorState

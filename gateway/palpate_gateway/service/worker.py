@@ -16,12 +16,12 @@ from typing import Any, Literal
 
 from palpate.bus import Publisher, QueryAnswer
 from palpate.errors import (
+    ClaimedElsewhere,
     DeviceError,
     DeviceLost,
     DeviceTimeout,
     LinkError,
     PalpateError,
-    ClaimedElsewhere,
 )
 from palpate.health import Health
 from palpate.heartbeat import Turns

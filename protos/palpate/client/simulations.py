@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from palpate.bus import Session, endpoints
 from palpate.bus.topics import duty_root
+from palpate.config import check_name
 from palpate.errors import (
     ErrorCode,
     LinkError,
@@ -82,9 +83,9 @@ def ask_simulation(
     ``timeout_s``. While this call waits, a token on the bus shows it. If this process ends or is
     interrupted, the token vanishes and the service stops the simulation.
 
-    A service that is killed, hangs or is cut off while it works ends its answer, at the latest after
-    the lease of its link (2 s); then another one is asked, as is when one has no room. The error of
-    the last one that was asked is raised when none is left.
+    The answer of a service that is killed, stopped or cut off ends, at the latest after the lease
+    of its link (2 s); then another one is asked, and also when one has no room. When none is left,
+    the error of the last one is raised.
 
     Raises:
         LinkError: No finite-element service runs.
@@ -94,6 +95,7 @@ def ask_simulation(
         StreamTimeout: No answer within ``GRACE_S`` after the deadline.
         WireError: The request, or an answer, breaks the contract.
     """
+    check_name(sensor, "sensor")
     deadline_s = min(request.deadline_s or math.inf, timeout_s)
     end_s = time.monotonic() + deadline_s
     once = _StepsOnce(on_step)
@@ -152,8 +154,8 @@ class _StepsOnce:
         for part in parts:
             if self._mesh and part.mesh_sha256 not in (b"", self._mesh):
                 raise ReplicaDiffers(
-                    f"the service that began had the mesh {self._mesh.hex()[:12]}, and the one that "
-                    f"took over has {part.mesh_sha256.hex()[:12]}",
+                    f"the service that began had the mesh {self._mesh.hex()[:12]}, and the one "
+                    f"that took over has {part.mesh_sha256.hex()[:12]}",
                     remedy="give all of them the same version and parameters: palpate fleet",
                 )
             self._mesh = part.mesh_sha256 or self._mesh
@@ -173,6 +175,7 @@ def ask_cancellation(session: Session, request_id: str, *, sensor: str, timeout_
     Raises:
         PalpateError: None answers.
     """
+    check_name(sensor, "sensor")
     replies = session.query_all(
         endpoints.CANCEL_SIMULATION,
         SimulationCancelRequest(request_id),
