@@ -149,6 +149,18 @@ def top(
     )
 
 
+@app.command(epilog=example("palpate fleet --connect tls/192.168.1.2:7447 --tls operator"))
+def fleet(
+    connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """All stations that are seen from a router, e.g. of a site; fails if anything is wrong."""
+    from palpate_deploy.station.fleet import show_fleet
+
+    raise typer.Exit(show_fleet(client_link(connect, tls), as_json=json_))
+
+
 @app.command(epilog=example("palpate doctor --profile virtual"))
 def doctor(profile: ProfileOption = DEFAULT_PROFILE, json_: JsonOption = False) -> None:
     """Check what a station needs on this host; each check is ok, warn or fail, with a fix."""
