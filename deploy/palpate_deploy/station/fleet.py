@@ -125,7 +125,9 @@ def _print(console: Console, found: Sequence[StationSummary]) -> None:
             f"[{colour}]{well} of {len(one.processes)}[/]",
             "\n".join(_sensor(sensor) for sensor in one.sensors) or "-",
             "\n".join(_estimates(process) for process in one.processes if process.models) or "-",
-            "\n".join(sorted({cell(model) for process in one.processes for model in process.models}))
+            "\n".join(
+                sorted({cell(model) for process in one.processes for model in process.models})
+            )
             or "-",
             "\n".join(
                 cell(f"{by['sensor']}: {by['instance']} ({by['digest'][:8]})")
@@ -155,4 +157,3 @@ def _estimates(process: ProcessActivity) -> str:
     if process.message.startswith("standby"):
         return cell(f"{name} stands by")
     return cell(f"{name} {'-' if process.out_hz is None else f'{process.out_hz:.0f}/s'}")
-
