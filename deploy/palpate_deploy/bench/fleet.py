@@ -2,8 +2,8 @@
 
 A station is its own router and one process that publishes frames and estimates of a finger at
 100 Hz, as large as those of a gateway and a features service; what a whole station needs is
-measured once, on one host. All links between hosts have mutual TLS. In the same run a consumer is linked to
-such a process directly, without any router: the floor of the latency.
+measured once, on one host. All links between hosts have mutual TLS. In the same run a consumer is
+linked to such a process directly, without any router: the floor of the latency.
 
 Then the host of an active features service, or of a finite-element service, is killed, stopped or
 cut off, and the time until another one answers is taken.

@@ -172,7 +172,7 @@ class Profile(StrictConfig):
     """
 
     station: Name = "lab"
-    replica: str = Field(default="", pattern=r"^([a-z0-9][a-z0-9_-]{0,31})?$")
+    replica: str = Field(default="", pattern=r"^([a-z0-9][a-z0-9_-]{0,47})?$")
     processes: tuple[Service, ...] = Field(default=SERVICES, min_length=1)
     link: LinkConfig = LinkConfig()
     router: RouterConfig = RouterConfig()
