@@ -103,18 +103,20 @@ def results_page(values: Mapping[str, Any]) -> str:
     return f"""# Fleets: what stations behind a site's router cost
 
 <!-- Written by docs/make_fleet.py from fleet.json; do not edit. -->
-Measured by `palpate bench fleet --out docs/results/fleet.json`, as root: every station, the site and
-the consumer is a network namespace of one host, joined by virtual cables (veth), with mutual TLS. All of them share
+Measured by `palpate bench fleet --out docs/results/fleet.json`, as root: every station, the site
+and the consumer is a network namespace of one host, joined by virtual cables (veth), with mutual
+TLS. All of them share
 {machine["cpus"]} cores ({machine["cpu"]}; load {
         machine["load_1min"]
     } at the end), so that latencies of
-many stations are those of a full host, not of a network. How to use these numbers: [fleet.md](../fleet.md).
+many stations are those of a full host, not of a network. How to use these numbers:
+[fleet.md](../fleet.md).
 
 ## What crosses, and what it costs
 
 A station is its own router and one process that publishes frames and estimates of one finger at
-100 Hz each. "Listens": what one consumer at the site subscribes to. kB/s are of one station's cable, both ways, with all
-framing. Latency is from the stamp to the consumer, through both routers.
+100 Hz each. "Listens": what one consumer at the site subscribes to. kB/s are of one station's
+cable, both ways, with all framing. Latency is from the stamp to the consumer, through both routers.
 
 {
         _table(
@@ -123,14 +125,13 @@ framing. Latency is from the stamp to the consumer, through both routers.
             rows,
         )
     }
-The floor is the same process with a consumer that is linked to it directly, over one cable and without a router,
-at the same time.
+The floor is the same process with a consumer that is linked to it directly, over one cable and
+without a router, at the same time.
 
 {_table("stations | floor p50, p99 ms | raw frames: times the floor's p50 | p99", floors)}
 ## A whole station
 
-Router, gateway of one virtual finger and features service, each a process. With a real BioTac the gateway takes
-[less](hand.md).
+Router, gateway of one virtual finger and features service, each a process.
 
 {_table("process | % of a core | MB", whole)}
 ## Delay and loss on the cable
@@ -138,15 +139,16 @@ Router, gateway of one virtual finger and features service, each a process. With
 {_table("tc netem | what one consumer of one station saw", impaired)}
 ## A standby takes over
 
-Two features services on two hosts serve one finger; the host of the active one fails. The gap is the longest pause between
-estimates at a consumer, of one trial each line; "twice" are estimates of one frame that came from both. A subscriber of
-palpate drops and counts those.
+Two features services on two hosts serve one finger; the host of the active one fails. The gap is
+the longest pause between estimates at a consumer, one trial a line; "twice" are estimates of one
+frame that came from both, until 8 s after the fault was over. A subscriber of palpate drops and
+counts those; this consumer took what crossed the cable.
 
 {_table("the active one is | gap, s | twice | out of order", takeovers)}
 ## A simulation is asked again
 
-Two finite-element services on two hosts; the one that computes fails. The time is until the other one has taken the
-same request.
+Two finite-element services on two hosts; the one that computes fails. The time is until the other
+one has taken the same request.
 
 {_table("the one that computes is | after, s | outcome", asked)}"""
 
@@ -162,8 +164,8 @@ def plan_table(values: Mapping[str, Any]) -> str:
         most = f"{SHARE / cpu:.0f}" if cpu > 1e-4 else "more than measured"
         rows.append([words, f"{rate / 1e3:.1f}", f"{100 * cpu:.2f}", f"{memory / 1e6:.2f}", most])
     return _table(
-        "one consumer listens to | kB/s a station | site router, % of a core a station | MB a station"
-        f" | stations at {100 * SHARE:.0f} % of a core",
+        "one consumer listens to | kB/s a station | site router, % of a core a station"
+        f" | MB a station | stations at {100 * SHARE:.0f} % of a core",
         rows,
     )
 
@@ -192,7 +194,7 @@ def main() -> int:
         if not path.exists() or path.read_text(encoding="utf-8") != text
     ]
     if stale:
-        print(f"{', '.join(stale)}: not what fleet.json says; run python docs/make_fleet.py")
+        sys.stderr.write(f"{', '.join(stale)}: not as fleet.json says; run docs/make_fleet.py\n")
     return 1 if stale else 0
 
 

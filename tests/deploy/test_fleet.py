@@ -90,3 +90,20 @@ def test_a_site_without_certificates_is_not_joined_with_roles(
     path.write_text(text + '\n[link]\ncertificates = "/etc/palpate/certs"\n', encoding="utf-8")
     with pytest.raises(ConfigError, match="shows no certificate"):
         load_profile(path)
+
+
+@pytest.mark.parametrize(
+    ("connect", "listen", "direct"),
+    [
+        (("tls/127.0.0.1:7447",), ("tls/127.0.0.1:0",), True),
+        (("tls/192.168.1.2:7447",), ("tls/127.0.0.1:0",), False),
+        (("tls/192.168.1.2:7447",), ("tls/192.168.1.9:7448",), True),
+        ((), ("tls/127.0.0.1:0",), True),
+    ],
+)
+def test_links_are_direct_where_others_reach_them(
+    connect: tuple[str, ...], listen: tuple[str, ...], *, direct: bool
+) -> None:
+    link = LinkConfig(connect=connect, listen=listen, certificates=Path("/etc/palpate/certs"))
+    assert link.links_directly is direct
+    assert link.model_copy(update={"direct": False}).links_directly is False

@@ -113,3 +113,77 @@ def test_a_stream_crosses_only_for_a_subscriber() -> None:
     assert phases["features"]["bytes_hz_each"] > 5 * phases["nobody"]["bytes_hz_each"]
     assert phases["electrodes"]["heard_stations"] == 1
     assert of(os.getpid()) == []
+
+
+ROUTER = """
+import sys, threading
+from palpate.bus import run_router
+from palpate.config import LinkConfig, TlsConfig
+where, certificates = sys.argv[1:]
+link = LinkConfig(connect=(), listen=("tls/127.0.0.1:0",), tls=TlsConfig.of_folder(certificates))
+run_router((where,), threading.Event(), link=link)
+"""
+
+SERVICE = """
+import sys, time
+from palpate.bus import Session, endpoints
+from palpate.messages import ServiceRequest, ServiceState, Status
+from palpate_deploy.bench.fleet_parts import link_to
+with Session.open(link_to(sys.argv[1], sys.argv[2])) as session:
+    answer = Status("features", "features", ServiceState.READY, 1, 1, 1.0, "1")
+    session.queryable(
+        endpoints.STATUS, lambda _: answer, service="features", instance="features"
+    )
+    print("up", flush=True)
+    time.sleep(1000)
+"""
+
+ASKER = """
+import sys, time
+from palpate.bus import Session, endpoints
+from palpate.errors import PalpateError
+from palpate.messages import ServiceRequest
+from palpate_deploy.bench.fleet_parts import link_to
+with Session.open(link_to(sys.argv[1], sys.argv[2])) as session:
+    time.sleep(float(sys.argv[3]))
+    for _ in range(200):
+        try:
+            found = session.query(endpoints.STATUS, ServiceRequest(), service="features")
+            print(found.service)
+            break
+        except PalpateError as error:
+            time.sleep(0.1)
+"""
+
+
+@pytest.mark.parametrize("after_s", [0.0, 4.0], ids=["at once", "when it has settled"])
+def test_two_hosts_at_one_router_reach_one_another(tmp_path: Path, after_s: float) -> None:
+    """Their listeners are on loopback, where the other one cannot reach them."""
+    with contextlib.ExitStack() as stack:
+        one = fleet.Fleet(tmp_path, stack)
+        first, second = one.lab.add("first"), one.lab.add("second")
+        certificates = str(one.certificates)
+        where = f"tls/0.0.0.0:{fleet.PORT}"
+        one.start(
+            one.lab.at_site([sys.executable, "-c", ROUTER, where, f"{certificates}/router"]),
+            "router",
+        )
+        one.start(
+            first.inside(
+                [sys.executable, "-c", SERVICE, fleet.up_to(first), f"{certificates}/service"]
+            ),
+            "service",
+        )
+        asked = subprocess.run(
+            second.inside(
+                [
+                    *(sys.executable, "-c", ASKER, fleet.up_to(second)),
+                    *(f"{certificates}/robot", str(after_s)),
+                ]
+            ),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=PATIENCE_S,
+        )
+        assert asked.stdout.strip() == "features", asked.stderr

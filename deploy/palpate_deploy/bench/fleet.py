@@ -31,7 +31,7 @@ from palpate.config import Role
 from palpate.errors import LinkError
 from palpate_deploy.bench.harness import read_rows
 from palpate_deploy.bench.hosts import Host, HostLab
-from palpate_deploy.bench.results import finish
+from palpate_deploy.bench.results import finish, machine
 from palpate_deploy.station.certificates import issue, make_authority
 from palpate_deploy.station.lifetime import start_child, stop_child
 
@@ -157,7 +157,10 @@ def measure_scale(stations: int, seconds: float) -> dict[str, Any]:
         # The floor's consumer sits at the site's end of that cable: one link, no router.
         command = [sys.executable, "-m", "palpate_deploy.bench.fleet_parts", "consumer", door]
         floor_consumer = fleet.start(
-            fleet.lab.at_site([*command, certs, "electrodes", str(direct)]), "floor"
+            fleet.lab.at_site(
+                [*command, certs, "electrodes", str(direct), f"tls/{floor.site}:{PORT + 1}"]
+            ),
+            "floor",
         )
         _until(direct.with_suffix(".up").exists, "the floor does not start")
         time.sleep(_SETTLE_S + 1.0 * stations)
@@ -476,17 +479,26 @@ def run_fleet(
     for number in stations:
         console.print(f"{number} stations ...")
         values["scale"].append(measure_scale(number, seconds))
+        _keep(values, out)
     console.print("a whole station ...")
     values["station"] = measure_whole_station(seconds)
     console.print("delays and losses ...")
     values["impaired"] = measure_impaired(seconds)
+    _keep(values, out)
     if times:
         console.print("a standby takes over ...")
         values["takeovers"] = measure_takeovers(times)
+        _keep(values, out)
         console.print("simulations are asked again ...")
         values["asked_again"] = measure_asked_again(times)
     finish("fleet", values, lambda: _show(values), as_json=as_json, save=save, out=out)
     return 0
+
+
+def _keep(values: dict[str, Any], out: Path | None) -> None:
+    """Write what is known so far: a measurement that breaks off leaves that."""
+    if out is not None:
+        out.write_text(json.dumps({**values, "machine": machine()}, indent=2) + "\n", "utf-8")
 
 
 def _show(values: dict[str, Any]) -> None:

@@ -88,11 +88,11 @@ def publisher(connect: str, certificates: str, station: str, listen: str = "") -
             )
 
 
-def consumer(connect: str, certificates: str, topic: str, out: str) -> None:
+def consumer(connect: str, certificates: str, topic: str, out: str, listen: str = "") -> None:
     """Take a stream of every station until ``SIGTERM``; then write its stamps and arrivals."""
     stop = stop_on_sigterm()
     kept: list[tuple[str, bytes, int]] = []
-    link = link_to(connect, f"{certificates}/robot")
+    link = link_to(connect, f"{certificates}/robot", listen=listen)
     with Session.open(link) as session:
         tap = session.tap([TOPICS[topic]], station="*", delivery=Delivery.QUEUE)
         equal_terms()

@@ -239,7 +239,7 @@ class Session(Closing):
         Raises:
             LinkError: No router within ``link.wait_for_router_s``, or a port is in use.
         """
-        raw = open_zenoh(link, "peer" if link.direct else "client")
+        raw = open_zenoh(link, "peer" if link.links_directly else "client")
         # Zenoh opens a peer at once and looks for the router in the background.
         if link.wait_for_router_s >= 0 and link.connect:
             deadline = time.monotonic() + link.wait_for_router_s
@@ -562,7 +562,7 @@ class Session(Closing):
         Raises:
             LinkError: There is no router.
         """
-        if not self._link.direct or not self._link.connect:
+        if not self._link.links_directly or not self._link.connect:
             return self
         with self._observing_lock:
             if self._observing is None:
