@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Any
 
 import pytest
@@ -75,7 +76,7 @@ def test_a_robot_at_the_site_hears_each_station_by_its_name(examples: dict[str, 
         links = {}
         for name in ("arm1", "arm2"):
             link, up = stack.enter_context(station(name, site))
-            until(lambda up=up: up.connected)
+            until(partial(getattr, up, "connected"))
             links[name] = link
         robot = stack.enter_context(Session.open(lab))
         heard = {
@@ -84,7 +85,7 @@ def test_a_robot_at_the_site_hears_each_station_by_its_name(examples: dict[str, 
         }
         for name, link in links.items():
             with Session.open(link, station=name) as gateway:
-                until(lambda gateway=gateway, name=name: sends(gateway, frame, heard[name]))
+                until(partial(sends, gateway, frame, heard[name]))
         for name in links:
             others = heard[name].counters
             assert others.get("received", 0) > 0
@@ -137,7 +138,7 @@ def test_a_station_starts_without_its_site_and_finds_it_later(examples: dict[str
                 with router(site) as lab, Session.open(lab, station="arm1") as robot:
                     until(lambda: up.connected)
                     heard = robot.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
-                    until(lambda heard=heard: sends(gateway, frame, heard))
+                    until(partial(sends, gateway, frame, heard))
                 until(lambda: not up.connected)
             assert up.refusal is None
             stack.close()

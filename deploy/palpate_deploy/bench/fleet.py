@@ -305,7 +305,7 @@ def measure_takeovers(times: int) -> list[dict[str, Any]]:
         time.sleep(15.0)
         running[waiting] = service(waiting)
         time.sleep(15.0)
-        found = []
+        found: list[dict[str, Any]] = []
         for kind in [*FAULTS] * times:
             out = fleet.folder / f"{len(found)}.npz"
             watch = fleet.part(other, "consumer", up_to(other), str(certs), "features", str(out))
@@ -370,7 +370,7 @@ def measure_asked_again(times: int) -> list[dict[str, Any]]:
         time.sleep(45.0)
         fleet.part(other, "asker", up_to(other), str(certs), "pool", "120")
         log = next(fleet.folder.glob("*-asker-consumer.log"))
-        found = []
+        found: list[dict[str, Any]] = []
         for kind in [*FAULTS] * times:
             lines = _lines(log)
             _until(lambda: _solving(_lines(log), len(lines)), "no simulation runs")  # noqa: B023
