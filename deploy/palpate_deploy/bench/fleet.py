@@ -30,7 +30,7 @@ from rich.console import Console
 from palpate.config import Role
 from palpate.errors import LinkError
 from palpate_deploy.bench.harness import read_rows
-from palpate_deploy.bench.hosts import Host, HostLab
+from palpate_deploy.bench.hosts import HostLab, LabHost
 from palpate_deploy.bench.results import finish, machine
 from palpate_deploy.station.certificates import issue, make_authority
 from palpate_deploy.station.lifetime import start_child, stop_child
@@ -67,7 +67,7 @@ class Fleet:
         self._stack.callback(_end, process)
         return process
 
-    def part(self, host: Host, *words: str) -> subprocess.Popen[bytes]:
+    def part(self, host: LabHost, *words: str) -> subprocess.Popen[bytes]:
         """Start a part of the bench on a host."""
         command = [sys.executable, "-m", "palpate_deploy.bench.fleet_parts", *words]
         return self.start(host.inside(command), f"{words[0]}-{host.name}")
@@ -85,7 +85,7 @@ class Fleet:
         process: subprocess.Popen[bytes] = self.run(self.lab.at_site, "router", profile)
         return process
 
-    def station_router(self, host: Host) -> subprocess.Popen[bytes]:
+    def station_router(self, host: LabHost) -> subprocess.Popen[bytes]:
         """Start the router of the station on a host."""
         up = f"connect = [{json.dumps(up_to(host))}]\n"
         profile = _profile(host.name, ["router"], self.certificates, listen=_LOCAL, router=up)
@@ -93,7 +93,7 @@ class Fleet:
         return process
 
 
-def up_to(host: Host) -> str:
+def up_to(host: LabHost) -> str:
     """The site's router, as a host reaches it."""
     return f"tls/{host.site}:{PORT}"
 
@@ -253,7 +253,9 @@ def measure_impaired(seconds: float) -> list[dict[str, Any]]:
 
 
 @contextlib.contextmanager
-def _fault(fleet: Fleet, host: Host, process: subprocess.Popen[bytes], kind: str) -> Iterator[int]:
+def _fault(
+    fleet: Fleet, host: LabHost, process: subprocess.Popen[bytes], kind: str
+) -> Iterator[int]:
     """A fault while the block runs; when it began [ns, monotonic]."""
     began_ns = time.monotonic_ns()
     if kind == "kill":
@@ -320,7 +322,8 @@ def measure_takeovers(times: int) -> list[dict[str, Any]]:
             if kind == "kill":
                 running[active] = service(active)
                 time.sleep(12.0)
-            active, waiting = waiting, active
+            if kind != "cut":  # of two that published, the one that began earlier goes on
+                active, waiting = waiting, active
         return found
 
 

@@ -42,7 +42,7 @@ def why_no_hosts() -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Host:
+class LabHost:
     """One host: its namespace, its address, and the site's address on the cable to it."""
 
     name: str
@@ -67,7 +67,7 @@ class HostLab(Closing):
         if reason := why_no_hosts():
             raise ConfigError(f"no hosts can be made: {reason}", remedy="run it as root, on Linux")
         remove_leftovers()
-        self._hosts: dict[str, Host] = {}
+        self._hosts: dict[str, LabHost] = {}
         self.site = self._namespace("site")
 
     def _namespace(self, name: str) -> str:
@@ -76,7 +76,7 @@ class HostLab(Closing):
         _ip("-n", namespace, "link", "set", "lo", "up")
         return namespace
 
-    def add(self, name: str) -> Host:
+    def add(self, name: str) -> LabHost:
         """A new host with a cable to the site."""
         number = len(self._hosts) + 1
         namespace = self._namespace(name)
@@ -85,7 +85,7 @@ class HostLab(Closing):
             *("-n", self.site, "link", "add", cable, "type", "veth"),
             *("peer", "name", "eth0", "netns", namespace),
         )
-        host = Host(name, namespace, f"{_NET}.{number}.2", f"{_NET}.{number}.1", cable)
+        host = LabHost(name, namespace, f"{_NET}.{number}.2", f"{_NET}.{number}.1", cable)
         _ip("-n", self.site, "address", "add", f"{host.site}/24", "dev", cable)
         _ip("-n", namespace, "address", "add", f"{host.address}/24", "dev", "eth0")
         _ip("-n", self.site, "link", "set", cable, "up")
@@ -98,13 +98,13 @@ class HostLab(Closing):
         """The command that runs ``command`` at the site."""
         return ["ip", "netns", "exec", self.site, *command]
 
-    def plug(self, host: Host, *, plugged: bool) -> None:
+    def plug(self, host: LabHost, *, plugged: bool) -> None:
         """Plug the cable of a host in, or pull it: packets are lost, and no connection is reset."""
         _ip("-n", self.site, "link", "set", host.cable, "up" if plugged else "down")
         if plugged:  # the kernel dropped it with the link
             _ip("-n", host.namespace, "route", "replace", "default", "via", host.site)
 
-    def impair(self, host: Host, words: Sequence[str]) -> str:
+    def impair(self, host: LabHost, words: Sequence[str]) -> str:
         """Delay or lose packets both ways (``tc netem``), e.g. ``("delay", "10ms")``; () = none.
 
         Returns:
@@ -120,7 +120,7 @@ class HostLab(Closing):
                 return done.stderr.decode().strip() or "tc failed"
         return ""
 
-    def crossed_bytes(self, host: Host) -> tuple[int, int]:
+    def crossed_bytes(self, host: LabHost) -> tuple[int, int]:
         """Bytes that have crossed the cable: from the host to the site, and back."""
         statistics = f"/sys/class/net/{host.cable}/statistics"
         text = subprocess.run(
