@@ -23,11 +23,13 @@ from palpate.bus.topics import (
     ASKING_ROOT,
     CLAIM_ROOT,
     CONTRACT_VERSION,
+    DUTY_ROOT,
     ENCODING_PREFIX,
     LIVE_ROOT,
     MAX_PAYLOAD_BYTES,
     ROBOT_POSE,
     ROOT,
+    STATION_ROOT,
     TOPICS,
     Topic,
 )
@@ -69,6 +71,11 @@ TOKENS = {
     "first 32 hexadecimal digits of the SHA-256 of its request_id",
     f"{CLAIM_ROOT}/{{station}}/{{sensor}}/{{held|wanted}}/{{since_wall_ns}}/{{session_id}}/{{instance}}"
     "/{host}/{serial}": "a gateway publishes this sensor, or waits for it",
+    f"{DUTY_ROOT}/{{duty}}/{{station}}/{{sensor}}/{{held|wanted}}/{{since_wall_ns}}/{{session_id}}"
+    "/{instance}/{host}/{serial}": "a service does this for a sensor, or stands by; serial is the "
+    "digest of what its answers depend on",
+    f"{STATION_ROOT}/{{station}}/router/{{held|wanted}}/{{since_wall_ns}}/{{session_id}}/{{instance}}"
+    "/{host}/{serial}": "a router has the name of this station at a site, or waits for it",
 }
 """Liveliness tokens, and what holds while they exist."""
 

@@ -73,6 +73,7 @@ SECTIONS = {
         "docs/operations",
         "docs/failures",
         "docs/security",
+        "docs/fleet",
         "docs/devices/README",
         "docs/ros",
     ],

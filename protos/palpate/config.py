@@ -242,6 +242,21 @@ class LinkConfig(StrictConfig):
         """Whether certificates say what others may do."""
         return self.certificates is not None or (self.tls is not None and self.tls.roles)
 
+    @property
+    def links_directly(self) -> bool:
+        """Whether a process links to others directly: as ``direct`` says, where they can reach it.
+
+        One that joins a router on another host and listens on loopback cannot be reached by the
+        other processes of that router. As a peer it would get nothing of theirs, because the router
+        passes nothing on between peers; so all goes through the router.
+        """
+
+        def here(endpoints: tuple[str, ...]) -> bool:
+            return any(is_loopback(endpoint_host_port(one)[0]) for one in endpoints)
+
+        beyond = any(not is_loopback(endpoint_host_port(one)[0]) for one in self.listen)
+        return self.direct and (not self.connect or here(self.connect) or beyond)
+
     @model_validator(mode="after")
     def _exposed_listener_needs_tls(self) -> LinkConfig:
         if self.tls is not None and self.certificates is not None:

@@ -137,10 +137,22 @@ class LinkError(PalpateError, OSError):
     code = ErrorCode.UNAVAILABLE
 
 
-class SensorTaken(PalpateError, OSError):
-    """Another gateway publishes under the key of this sensor."""
+class ClaimedElsewhere(PalpateError, OSError):
+    """Another process holds what this one claims."""
 
     code = ErrorCode.UNAVAILABLE
+
+
+class SensorTaken(ClaimedElsewhere):
+    """Another gateway publishes under the key of this sensor."""
+
+
+class StationTaken(ClaimedElsewhere):
+    """Another station of the site has this name."""
+
+
+class ReplicaDiffers(ClaimedElsewhere):
+    """A replica under the same key would give other answers."""
 
 
 class StreamTimeout(PalpateError, TimeoutError):

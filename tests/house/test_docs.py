@@ -137,6 +137,7 @@ def test_palpate_commands_exist(
         "make_messages.py",
         "make_asyncapi.py",
         "make_failures.py",
+        "make_fleet.py",
         "make_house.py",
         "make_install.py",
         "make_models.py",

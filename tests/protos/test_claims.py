@@ -17,7 +17,7 @@ from palpate.bus import SensorClaims, Session, run_router
 from palpate.bus.claims import YIELD_S
 from palpate.bus.topics import SensorClaim, claim_key
 from palpate.config import LinkConfig
-from palpate.errors import SensorTaken
+from palpate.errors import ClaimedElsewhere, SensorTaken
 
 PATIENCE_S = 20.0
 LEASE_S = 2.0
@@ -53,7 +53,7 @@ def held_within_patience(claims: SensorClaims) -> bool:
     return claims.wait("finger", PATIENCE_S)
 
 
-def refusal_of(claims: SensorClaims) -> SensorTaken:
+def refusal_of(claims: SensorClaims) -> ClaimedElsewhere:
     deadline = time.monotonic() + PATIENCE_S
     while (refusal := claims.refusal("finger")) is None:
         assert time.monotonic() < deadline, "it was not refused"

@@ -149,6 +149,18 @@ def top(
     )
 
 
+@app.command(epilog=example("palpate fleet --connect tls/192.168.1.2:7447 --tls operator"))
+def fleet(
+    connect: ConnectOption = DEFAULT_CONNECT,
+    tls: TlsOption = None,
+    json_: JsonOption = False,
+) -> None:
+    """All stations that are seen from a router, e.g. of a site; fails if anything is wrong."""
+    from palpate_deploy.station.fleet import show_fleet
+
+    raise typer.Exit(show_fleet(client_link(connect, tls), as_json=json_))
+
+
 @app.command(epilog=example("palpate doctor --profile virtual"))
 def doctor(profile: ProfileOption = DEFAULT_PROFILE, json_: JsonOption = False) -> None:
     """Check what a station needs on this host; each check is ok, warn or fail, with a fix."""
@@ -394,6 +406,36 @@ def echo(
     )
 
 
+probe_app = group("What a cluster asks of one process: exit status 0 = yes, 1 = no.")
+
+
+@probe_app.command(epilog=example("palpate probe live"))
+def live() -> None:
+    """Whether the process of this container beats; a hung one does not."""
+    from palpate_deploy.station.probe import why_not_live
+
+    _answer(why_not_live())
+
+
+@probe_app.command(epilog=example("palpate probe ready fem --profile virtual"))
+def ready(
+    service: Annotated[str, typer.Argument(help="E.g. router, fem.")],
+    profile: ProfileOption = DEFAULT_PROFILE,
+) -> None:
+    """Whether a process of this profile serves, as the router sees it."""
+    from palpate_deploy.station.probe import why_not_ready
+    from palpate_deploy.station.profile import load_profile
+
+    _answer(why_not_ready(service, load_profile(profile)))
+
+
+def _answer(why_not: str) -> None:
+    if why_not:
+        print(why_not)
+        raise typer.Exit(1)
+
+
+app.add_typer(probe_app, name="probe")
 app.add_typer(topic_app, name="topic")
 app.add_typer(model_app, name="model")
 app.add_typer(bundle_app, name="bundle")

@@ -190,3 +190,29 @@ def soak(
     raise typer.Exit(
         run_soak(minutes=minutes, fingers=fingers, fem=fem, out=out, as_json=json_, save=save)
     )
+
+
+@bench_app.command(epilog=example("palpate bench fleet --stations 1 --stations 4 --times 0"))
+def fleet(
+    stations: Annotated[
+        list[int] | None,
+        typer.Option(min=1, max=20, help="Stations at once; repeat. Default: 1, 2, 4, 8, 16."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of each part [s].")] = 8.0,
+    times: Annotated[int, typer.Option(min=0, help="How often each fault; 0 = none.")] = 3,
+    out: OutOption = None,
+    json_: JsonOption = False,
+    save: SaveOption = False,
+) -> None:
+    """Stations behind a site's router, on network namespaces as hosts: costs and failover; root."""
+    from palpate_deploy.bench.fleet import run_fleet
+
+    code = run_fleet(
+        stations=stations or [1, 2, 4, 8, 16],
+        seconds=seconds,
+        times=times,
+        as_json=json_,
+        save=save,
+        out=out,
+    )
+    raise typer.Exit(code)

@@ -47,6 +47,15 @@ def install(
             help="Write files for docker compose and podman there, and install nothing.",
         ),
     ] = None,
+    kubernetes: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Write manifests of a site in a cluster there, likewise."
+        ),
+    ] = None,
+    replicas: Annotated[
+        int, typer.Option(min=1, max=64, help="With --kubernetes: pods of each service.")
+    ] = 2,
     root: RootOption = Path("/"),
     program: Annotated[
         str,
@@ -62,6 +71,11 @@ def install(
     """
     from palpate_deploy.install.plan import InstallOrder
 
+    if kubernetes is not None:
+        from palpate_deploy.install.kubernetes import write_manifests
+
+        write_manifests(profile, kubernetes, name=name, replicas=replicas)
+        return
     order = InstallOrder(profile, name, root, program, tuple(allow or ()))
     if containers is not None:
         from palpate_deploy.install.containers import write_containers

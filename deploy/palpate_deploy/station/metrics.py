@@ -151,7 +151,7 @@ class StationCollector:
 
         def labels(sensor: str) -> tuple[str, ...]:
             # A supervisor speaks for others: what stands in front is the name of a process.
-            if sensor and (status.service, status.instance) == SUPERVISOR:
+            if sensor and status.service == SUPERVISOR[0]:
                 return (self._station, sensor, sensor, "")
             return (*process, sensor)
 

@@ -75,16 +75,17 @@ def role_of(service: Service) -> Role:
 def _run(service: Service, profile: Profile, stop: threading.Event) -> None:
     link = profile.link.as_role(role_of(service))
     if service == "router":
-        from palpate.bus import run_router
+        from palpate_deploy.station.site import run_station_router
 
-        run_router(profile.router.listen, stop, link=link)
+        run_station_router(profile, link, stop)
         return
     if service == "gateway" and profile.gateway.pace != "fast":
         from palpate_gateway.one_core import stay_on_one_core
 
         stay_on_one_core(profile.gateway.core)
     run = _entry_point(service, profile)
-    run(getattr(profile, service), link, profile.station, stop)
+    table, instance = getattr(profile, service), profile.instance(service)
+    run(table, link, profile.station, stop, instance=instance)
 
 
 def _entry_point(service: Service, profile: Profile) -> Callable[..., None]:

@@ -67,15 +67,18 @@ SERVICES: tuple[Service, ...] = ("router", "gateway", "features", "recorder")
 
 
 class RouterConfig(StrictConfig):
-    """Where the router listens.
+    """Where the router listens, and to which site it connects.
 
     Attributes:
         listen: Endpoints; any that is not loopback needs certificates: ``[link] certificates``.
+        connect: Endpoints of the router of a site, to which those of several stations connect, so
+            that the station can be reached from there; empty = the station is alone.
     """
 
     listen: tuple[str, ...] = (DEFAULT_ROUTER,)
+    connect: tuple[str, ...] = ()
 
-    @field_validator("listen")
+    @field_validator("listen", "connect")
     @classmethod
     def _endpoints(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for endpoint in value:
@@ -150,6 +153,8 @@ class Profile(StrictConfig):
 
     Attributes:
         station: Name of the station, the third part of every key on the bus.
+        replica: Distinguishes the processes of this profile where another host runs the same ones
+            for the same station: ``b`` makes ``features-b`` of ``features``. Empty = it has none.
         processes: The processes that ``palpate up`` starts here.
         link: How every process joins the bus.
         router: Where the router listens.
@@ -167,6 +172,7 @@ class Profile(StrictConfig):
     """
 
     station: Name = "lab"
+    replica: str = Field(default="", pattern=r"^([a-z0-9][a-z0-9_-]{0,47})?$")
     processes: tuple[Service, ...] = Field(default=SERVICES, min_length=1)
     link: LinkConfig = LinkConfig()
     router: RouterConfig = RouterConfig()
@@ -181,6 +187,10 @@ class Profile(StrictConfig):
     web: WebConfig = WebConfig()
     ros_bridge: RosBridgeConfig = Field(default_factory=RosBridgeConfig)
     log: LogConfig = LogConfig()
+
+    def instance(self, service: str) -> str:
+        """Name of a process among several of its kind; a station has one router."""
+        return f"{service}-{self.replica}" if self.replica and service != "router" else service
 
     @field_validator("processes")
     @classmethod
@@ -369,6 +379,20 @@ def _check_router(profile: Profile, where: str) -> None:
                 "mutual TLS",
                 remedy="use tls/HOST:PORT and [link] certificates, or listen on 127.0.0.1",
             )
+    own = {endpoint_host_port(endpoint) for endpoint in profile.router.listen}
+    for endpoint in profile.router.connect:
+        if profile.link.has_roles and not endpoint.startswith("tls/"):
+            raise ConfigError(
+                f"{where}: router.connect {endpoint!r} shows no certificate, so that nothing it "
+                "says would be believed",
+                remedy=f"connect to tls/{endpoint.partition('/')[2]}",
+            )
+        if endpoint_host_port(endpoint) in own:
+            raise ConfigError(
+                f"{where}: router.connect {endpoint!r} is where this router itself listens",
+                remedy="name the router of the site, or leave connect out",
+            )
+    for endpoint in profile.router.listen:
         if profile.link.has_roles and not endpoint.startswith("tls/"):
             raise ConfigError(
                 f"{where}: router.listen {endpoint!r} asks for no certificate, so that whoever "

@@ -31,8 +31,9 @@ def expectation_of(profile: str) -> Expectation:
     Raises:
         ConfigError: There is no such profile, or it is wrong.
     """
-    names = load_profile(profile).processes
-    return Expectation(f"profile {profile}", frozenset((name, name) for name in names))
+    loaded = load_profile(profile)
+    names = frozenset((name, loaded.instance(name)) for name in loaded.processes)
+    return Expectation(f"profile {profile}", names)
 
 
 def expectation_here(connect: Iterable[str], station: str) -> Expectation | None:
@@ -49,9 +50,14 @@ def expectation_here(connect: Iterable[str], station: str) -> Expectation | None
         places = {_place(endpoint) for endpoint in (*listens, *connects)}
         if values.get("station") != station or not places & wanted:
             continue
-        names = {(name, name) for name in values.get("processes", ())}
+        replica = values.get("replica", "")
+        services = [*values.get("processes", ())]
         if (folder / "supervisord.conf").exists():
-            names.add(SUPERVISOR)
+            services.append(SUPERVISOR[0])
+        names = {
+            (name, f"{name}-{replica}" if replica and name != ROUTER[0] else name)
+            for name in services
+        }
         return Expectation(f"run {folder.name} on this host", frozenset(names))
     return None
 

@@ -70,7 +70,7 @@ def run_up(profile: Profile, name: str) -> int:
         )
         with join(profile, wait_s=-1.0) as session:
             statuses = session.subscriber(STATUS, delivery=Delivery.QUEUE)
-            with SupervisorReport(session, supervisor.logs) as report:
+            with SupervisorReport(session, profile, supervisor.logs) as report:
                 shown = _Screen(console, supervisor, statuses, manager, report)
                 finished = shown.watch(stop)
         manager.say("STOPPING=1")
@@ -111,7 +111,7 @@ class _Screen:
         screen = Live(console=self._console, auto_refresh=False) if terminal else None
         with screen or contextlib.nullcontext():
             while not stop.is_set():
-                _take(self._statuses, self._known)
+                _take(self._statuses, self._known, self._supervisor.profile)
                 processes = self._processes()
                 self._report.tell(processes)
                 if screen is not None:
@@ -194,13 +194,15 @@ def _print_changes(
             )
 
 
-def _take(statuses: Subscriber[Status], known: dict[str, tuple[Status, float]]) -> None:
+def _take(
+    statuses: Subscriber[Status], known: dict[str, tuple[Status, float]], profile: Profile
+) -> None:
     while True:
         try:
             status = statuses.next(timeout_s=0).message
         except StreamTimeout:
             return
-        if status.instance == status.service:
+        if status.instance == profile.instance(status.service):
             known[status.service] = (status, time.monotonic())
 
 
@@ -250,11 +252,12 @@ class ProcessDown(PalpateError, RuntimeError):
 class SupervisorReport(Closing):
     """Publishes the state of the supervised processes; ``logs`` is the folder of their logs."""
 
-    def __init__(self, session: Session, logs: Path) -> None:
-        self._logs = logs
-        self._health = Health(*SUPERVISOR)
+    def __init__(self, session: Session, profile: Profile, logs: Path) -> None:
+        self._profile, self._logs = profile, logs
+        service, instance = SUPERVISOR[0], profile.instance(SUPERVISOR[1])
+        self._health = Health(service, instance)
         self._router: tuple[int, ProcessUsage] | None = None
-        self._presence = session.presence(SUPERVISOR[0], instance=SUPERVISOR[1])
+        self._presence = session.presence(service, instance=instance)
         self._reporter = HealthReporter(session, self._health)
         self._presence.ready()
 
@@ -264,7 +267,7 @@ class SupervisorReport(Closing):
             [
                 SupervisedProcess(
                     one.service,
-                    one.service,
+                    self._profile.instance(one.service),
                     one.state.lower(),
                     one.pid,
                     one.restarts,

@@ -6,15 +6,21 @@ gets an answer: its steps and how it ended, or a typed error.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import asdict
 
-from palpate.bus import Presence, Publisher, QueryAnswer, Session, endpoints
-from palpate.bus.topics import SIMULATION_PROGRESS, caller_key
+from palpate import __version__
+from palpate.bus import Presence, Publisher, QueryAnswer, SensorClaims, Session, endpoints
+from palpate.bus.queryable import Queryable
+from palpate.bus.topics import SIMULATION_PROGRESS, caller_key, duty_root
 from palpate.config import LinkConfig
 from palpate.errors import (
+    ClaimedElsewhere,
     ConfigError,
     ErrorCode,
     LinkError,
@@ -58,6 +64,9 @@ from palpate_fem.store.content import StoredFingertip
 SERVICE = "fem"
 
 _POLL_S = 0.1
+_CLAIM_S = 1.0
+"""A key that is free is claimed within this time [s]."""
+
 _FINGERTIPS_KNOWN = 16
 _REFUSED = (ErrorCode.INVALID_REQUEST, ErrorCode.RESOURCE_EXHAUSTED, ErrorCode.UNAVAILABLE)
 
@@ -369,26 +378,83 @@ def run(
     health.set_sensors((config.sensor,))
     with Session.open(link, station=station) as session:
         presence = session.presence(SERVICE, instance=instance)
+        claims = session.claims(
+            instance=instance, lease_s=link.lease_s, root=duty_root("simulate"), shared=True
+        )
+        claims.want(config.sensor, answers_digest(config))
         with (
             SimulationService(session, config, default, health, device) as service,
             HealthReporter(session, health, refresh=service.refresh_health),
+            _Doors(session, claims, service, config.sensor, instance) as doors,
         ):
             session.watch_callers(service.caller_gone)
             session.queryable(endpoints.CANCEL_SIMULATION, service.cancel, sensor=config.sensor)
-            served = session.stream_queryable(
-                endpoints.SIMULATE, service.simulate, sensor=config.sensor
-            )
             health.set_state(ServiceState.STARTING, "the first fingertip is being pressurised")
+            claims.wait(config.sensor, _CLAIM_S)
             try:
-                _serve(service.pool, health, presence, stop)
+                _serve(service.pool, health, presence, stop, doors)
             finally:
                 presence.not_ready()
                 health.set_state(ServiceState.STOPPING)
-                served.close()
+
+
+def answers_digest(config: FemConfig) -> str:
+    """Digest of all that the answers of a service depend on beside the request, in hex."""
+    told = {
+        "version": __version__,
+        "factory": config.factory,
+        "options": config.options,
+        "fingertip": asdict(config.fingertip.parameters()),
+    }
+    return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
+
+
+class _Doors(Closing):
+    """The keys at which a service is asked, while no replica that would answer otherwise has them.
+
+    Those are the key that all replicas share, and one of its own, by which callers choose.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        claims: SensorClaims,
+        service: SimulationService,
+        sensor: str,
+        instance: str,
+    ) -> None:
+        self._session, self._claims, self._service = session, claims, service
+        self._sensor, self._instance = sensor, instance
+        self._open: list[Queryable] = []
+
+    def check(self) -> ClaimedElsewhere | None:
+        """Open or close them; why they are closed, if they are. Call it often."""
+        holds = self._claims.holds(self._sensor)
+        if holds and not self._open:
+            simulate, name = self._service.simulate, self._instance
+            self._open = [
+                self._session.stream_queryable(endpoints.SIMULATE, simulate, sensor=self._sensor),
+                self._session.stream_queryable(
+                    endpoints.SIMULATE_AT, simulate, service=SERVICE, instance=name
+                ),
+            ]
+        elif not holds:
+            self.close()
+        return None if holds else self._claims.refusal(self._sensor)
+
+    def close(self) -> None:
+        """Close them; what was accepted is still answered."""
+        doors, self._open = self._open, []
+        for door in doors:
+            door.close()
 
 
 def _serve(
-    pool: WorkerPool | DevicePool, health: Health, presence: Presence, stop: threading.Event
+    pool: WorkerPool | DevicePool,
+    health: Health,
+    presence: Presence,
+    stop: threading.Event,
+    doors: _Doors,
 ) -> None:
     """Show as ready while a worker is; requests that come earlier wait for one.
 
@@ -401,6 +467,11 @@ def _serve(
             beat()
         if pool.broken is not None:
             raise pool.broken
+        if (refusal := doors.check()) is not None:
+            presence.not_ready()
+            told = ServiceState.DEGRADED, refusal.problem
+            health.fail(refusal)
+            continue
         if pool.ready:
             presence.ready()
             trouble = pool.trouble

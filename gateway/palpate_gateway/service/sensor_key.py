@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from palpate.bus import SensorClaims
-from palpate.errors import ConfigError, SensorTaken
+from palpate.errors import ClaimedElsewhere, ConfigError
 from palpate_gateway.config import SensorConfig
 
 _POLL_S = 0.1
@@ -18,7 +18,7 @@ class SensorKey:
     patience_s = 0.0
     """How long ``check`` may wait for others [s]."""
 
-    def wait(self, stop: threading.Event, refused: Callable[[SensorTaken], None]) -> bool:
+    def wait(self, stop: threading.Event, refused: Callable[[ClaimedElsewhere], None]) -> bool:
         """Wait until this gateway may publish; ``refused`` is called as long as another one does.
 
         Returns:
@@ -50,7 +50,7 @@ class ClaimedKey(SensorKey):
         self.patience_s = claims.lease_s
         claims.want(self._name)
 
-    def wait(self, stop: threading.Event, refused: Callable[[SensorTaken], None]) -> bool:
+    def wait(self, stop: threading.Event, refused: Callable[[ClaimedElsewhere], None]) -> bool:
         """See ``SensorKey``."""
         while not stop.is_set():
             if self._claims.wait(self._name, _POLL_S):
@@ -68,7 +68,7 @@ class ClaimedKey(SensorKey):
         """Each stream has one source, the finger itself first: two would mix their sequences.
 
         Raises:
-            SensorTaken: Another gateway has taken the key over.
+            ClaimedElsewhere: Another gateway has taken the key over.
             ConfigError: Another sensor of this gateway publishes the stream.
         """
         self._claims.check(self._name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 
-from palpate.errors import DeviceError, DeviceTimeout, PalpateError, SensorTaken
+from palpate.errors import ClaimedElsewhere, DeviceError, DeviceTimeout, PalpateError
 from palpate.health import Health
 from palpate.log import about
 from palpate.messages import ChannelFault, FaultKind, SensorState
@@ -90,7 +90,7 @@ class SensorReport:
                 extra=about(self._name),
             )
 
-    def is_taken(self, error: SensorTaken) -> None:
+    def is_taken(self, error: ClaimedElsewhere) -> None:
         """Another gateway publishes under its key; told once for each such gateway."""
         if error.problem == self._taken_by:
             return

@@ -16,12 +16,12 @@ from typing import Any, Literal
 
 from palpate.bus import Publisher, QueryAnswer
 from palpate.errors import (
+    ClaimedElsewhere,
     DeviceError,
     DeviceLost,
     DeviceTimeout,
     LinkError,
     PalpateError,
-    SensorTaken,
 )
 from palpate.health import Health
 from palpate.heartbeat import Turns
@@ -267,7 +267,7 @@ class SensorWorker:
                 self._calm_s, self._delivered = self._calm(), False
                 if self._pump():
                     return
-            except SensorTaken as error:
+            except ClaimedElsewhere as error:
                 if not self.device.info.live:
                     raise
                 self.serving = self.silent = False

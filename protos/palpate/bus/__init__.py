@@ -12,7 +12,7 @@ from palpate.bus.presence import AliveService, CallerToken, Presence
 from palpate.bus.pubsub import Publisher, ReceivedMessage, Subscriber
 from palpate.bus.query import Cancellation
 from palpate.bus.queryable import QueryAnswer
-from palpate.bus.router import run_router
+from palpate.bus.router import SiteLink, run_router
 from palpate.bus.tap import Tap, TapSample
 from palpate.bus.topics import MAX_PAYLOAD_BYTES
 
@@ -32,6 +32,7 @@ __all__ = [
     "ReceivedMessage",
     "SensorClaims",
     "Session",
+    "SiteLink",
     "Subscriber",
     "Tap",
     "TapSample",

@@ -19,9 +19,11 @@ from palpate.bus.endpoints import ENDPOINTS
 from palpate.bus.topics import (
     ASKING_ROOT,
     CLAIM_ROOT,
+    DUTY_ROOT,
     LIVE_ROOT,
     MAX_PAYLOAD_BYTES,
     ROOT,
+    STATION_ROOT,
     TOPICS,
     live_key,
     sensor_key,
@@ -98,6 +100,7 @@ QUESTIONS: dict[str, _Question] = {
     "zero": _Question(_OPERATOR, _GATEWAY),
     "models": _Question(_OPERATOR, _SERVICE),
     "simulate": _Question(_USERS, _SERVICE),
+    "simulate_at": _Question(_USERS, _SERVICE),
     "cancel_simulation": _Question(_USERS, _SERVICE),
     "status": _Question(_ALL, _PROCESSES),
     "model": _Question(_ALL, _SERVICE),
@@ -136,6 +139,8 @@ EVERY_KEY = (
     f"{LIVE_ROOT}/**",
     f"{ASKING_ROOT}/**",
     f"{CLAIM_ROOT}/**",
+    f"{DUTY_ROOT}/**",
+    f"{STATION_ROOT}/**",
 )
 """Key expressions that match every key of the contract: ``**`` matches no ``@chunk``."""
 
@@ -147,7 +152,7 @@ def rights(role: Role) -> dict[Deed, list[str]]:
         return {deed: list(EVERY_KEY) for deed in Deed}
     for key in EVERY_KEY[:2]:
         found.allow(Deed.SUBSCRIBE, key)
-    for key in (f"{LIVE_ROOT}/**", f"{ASKING_ROOT}/**", f"{CLAIM_ROOT}/**"):
+    for key in EVERY_KEY[2:]:
         found.allow(Deed.WATCH, key)
     for name, topic in TOPICS.items():
         if role in PUBLISHERS[name]:
@@ -163,6 +168,8 @@ def rights(role: Role) -> dict[Deed, list[str]]:
         found.allow(Deed.SHOW, live_key("*", _service_of(role), "*", "*"))
     if role is Role.GATEWAY:
         found.allow(Deed.SHOW, f"{CLAIM_ROOT}/**")
+    if role is Role.SERVICE:
+        found.allow(Deed.SHOW, f"{DUTY_ROOT}/**")
     if role in _USERS:
         found.allow(Deed.SHOW, f"{ASKING_ROOT}/**")
     return found.keys

@@ -7,6 +7,11 @@ whose process stands still, and one that waits takes over.
 
 A process that itself stood still for longer than the lease may have lost a claim without seeing it:
 it gives the claim up and begins again.
+
+What services do is claimed in the same way. Of those that publish estimates of a sensor one holds
+the claim and the others stand by. Of those that answer one key any number may hold it together, if
+all would answer alike: those whose ``serial``, here the digest of what their answers depend on, is
+that of the first. Routers claim the name of their station.
 """
 
 from __future__ import annotations
@@ -21,8 +26,15 @@ from dataclasses import dataclass, replace
 
 import zenoh
 
-from palpate.bus.topics import SensorClaim, claim_key, claims_key, parse_claim_key
-from palpate.errors import SensorTaken, WireError
+from palpate.bus.topics import (
+    CLAIM_ROOT,
+    STATION_ROOT,
+    SensorClaim,
+    claim_key,
+    claims_key,
+    parse_claim_key,
+)
+from palpate.errors import ClaimedElsewhere, ReplicaDiffers, SensorTaken, StationTaken, WireError
 from palpate.process import Closing
 
 SETTLE_S = 0.2
@@ -51,10 +63,11 @@ class _Own:
     tokens: dict[str, zenoh.LivelinessToken]
     rival: SensorClaim | None = None
     since_s: float | None = None
+    new: bool = True  # never held, and nobody else was seen
 
 
 class SensorClaims(Closing):
-    """The claims of one gateway. Safe to use from several threads; made by ``Session.claims``.
+    """The claims of one process. Safe to use from several threads; made by ``Session.claims``.
 
     Args:
         session: The Zenoh session.
@@ -62,6 +75,8 @@ class SensorClaims(Closing):
         session_id: This run of the gateway.
         instance: Its name among several.
         lease_s: After such a silence others see this process as gone [s].
+        root: What is claimed, see ``SensorClaim``.
+        shared: Whether several may hold a claim, if they are of the same ``serial``.
         joined: Whether the session has a link to others: without it a free sensor means nothing.
     """
 
@@ -74,7 +89,10 @@ class SensorClaims(Closing):
         instance: str,
         lease_s: float,
         joined: Callable[[], bool],
+        root: str = CLAIM_ROOT,
+        shared: bool = False,
     ) -> None:
+        self._root, self._shared = root, shared
         self._liveliness = session.liveliness()
         self._station, self._session_id, self._instance = station, session_id, instance
         self.lease_s = lease_s
@@ -86,20 +104,68 @@ class SensorClaims(Closing):
         self._alive_s = time.monotonic()
         self._was_joined, self._blind_until_s = False, 0.0
         self._subscriber = self._liveliness.declare_subscriber(
-            claims_key(station), self._on_sample, history=True
+            claims_key(station, root=root), self._on_sample, history=True
         )
         self._thread = threading.Thread(target=self._run, name="claims", daemon=True)
         self._thread.start()
 
-    def want(self, sensor: str) -> None:
+    def want(self, sensor: str, serial: str = "") -> None:
         """Claim a sensor; it is held as soon as nobody else holds it."""
         claim = SensorClaim(
-            self._station, sensor, self._session_id, False, 0, self._instance, platform.node()
+            self._station,
+            sensor,
+            self._session_id,
+            instance=self._instance,
+            host=platform.node(),
+            serial=serial,
+            root=self._root,
+            held=False,
         )
         with self._changed:
             if sensor not in self._own:
                 self._own[sensor] = own = _Own(claim, {})
                 self._declare(own, claim)
+                self._changed.notify_all()
+
+    def release(self, sensor: str) -> None:
+        """Withdraw the claim on a sensor, if there is one."""
+        with self._changed:
+            own = self._own.pop(sensor, None)
+        for token in own.tokens.values() if own is not None else ():
+            token.undeclare()
+
+    def holds(self, sensor: str) -> bool:
+        """Whether a wanted sensor is held now; does not wait. Call it before each message."""
+        own = self._own[sensor]
+        now_s = time.monotonic()
+        if own.claim.held and now_s - self._alive_s >= self.lease_s:
+            with self._changed:  # this process stood still, and may have lost it
+                self._look()
+        elif own.claim.held:
+            self._alive_s = now_s
+        return own.claim.held
+
+    def may_begin(self, sensor: str) -> bool:
+        """Whether a wanted sensor is held, or is new and nobody else is known to claim it.
+
+        For a service, whose first messages need not wait until the claim is held: of two that begin
+        at one instant both may send until each sees the token of the other, and who receives both
+        drops what comes twice.
+        """
+        if self.holds(sensor):
+            return True
+        own = self._own[sensor]
+        if not own.new:
+            return False
+        with self._changed:
+            own.new = not any(self._excludes(one, own.claim) for one in self._others.values())
+        return own.new
+
+    def rival(self, sensor: str) -> SensorClaim | None:
+        """The claim that comes before that of this process; None = there is none."""
+        own = self._own[sensor]
+        with self._changed:
+            return None if own.claim.held else own.rival
 
     def wait(self, sensor: str, timeout_s: float) -> bool:
         """Whether a sensor is held, at once or within this time."""
@@ -108,7 +174,7 @@ class SensorClaims(Closing):
             self._changed.wait_for(lambda: own.claim.held or self._closed, timeout_s)
             return own.claim.held
 
-    def refusal(self, sensor: str) -> SensorTaken | None:
+    def refusal(self, sensor: str) -> ClaimedElsewhere | None:
         """Why a sensor is not held: the gateway that comes first; None = it is, or may be soon."""
         own = self._own[sensor]
         with self._changed:
@@ -118,7 +184,7 @@ class SensorClaims(Closing):
         """Before each message: whether this gateway still holds the sensor.
 
         Raises:
-            SensorTaken: It does not.
+            ClaimedElsewhere: It does not; a ``SensorTaken`` where sensors are claimed.
         """
         own = self._own[sensor]
         now_s = time.monotonic()
@@ -190,7 +256,7 @@ class SensorClaims(Closing):
             if stood_still and own.claim.held:
                 _log.warning("this process stood still: who publishes %s?", own.claim.sensor)
                 self._become(own, held=False)
-            others = [one for one in self._others.values() if one.sensor == own.claim.sensor]
+            others = [one for one in self._others.values() if self._excludes(one, own.claim)]
             first = min(others, key=lambda one: one.order, default=own.claim)
             own.rival = first if first.order < own.claim.order else None
             may_change = (own.rival is None) != own.claim.held
@@ -200,6 +266,10 @@ class SensorClaims(Closing):
                 own.since_s = now_s
             elif now_s - own.since_s >= (YIELD_S if own.claim.held else SETTLE_S):
                 self._become(own, held=not own.claim.held)
+
+    def _excludes(self, other: SensorClaim, own: SensorClaim) -> bool:
+        """Whether only one of two claims can be held."""
+        return other.sensor == own.sensor and not (self._shared and other.serial == own.serial)
 
     def _sees(self, now_s: float) -> bool:
         """Whether the claims of others are known: the session is linked, and not just again."""
@@ -211,7 +281,7 @@ class SensorClaims(Closing):
         return joined and now_s >= self._blind_until_s
 
     def _become(self, own: _Own, *, held: bool) -> None:
-        own.since_s = None
+        own.since_s, own.new = None, False
         self._declare(own, replace(own.claim, held=held, since_wall_ns=time.time_ns()))
         self._changed.notify_all()
 
@@ -224,9 +294,23 @@ class SensorClaims(Closing):
             token.undeclare()
 
 
-def _taken(rival: SensorClaim) -> SensorTaken:
-    of = f" (serial {rival.serial})" if rival.serial else ""
+def _taken(rival: SensorClaim) -> ClaimedElsewhere:
     where = f" on host {rival.host}" if rival.host else ""
+    if rival.root == STATION_ROOT:
+        return StationTaken(
+            f"there is another station {rival.station!r} at this site, whose router runs{where}, "
+            f"session {rival.session_id:016x}",
+            remedy="give one of the two another name: `station` in its profile; until then this "
+            "one goes on without the site",
+        )
+    if rival.root != CLAIM_ROOT:
+        return ReplicaDiffers(
+            f"{rival.instance!r}{where} answers for {rival.sensor!r} of station {rival.station!r} "
+            f"and would answer otherwise: its digest is {rival.serial[:12]}",
+            remedy="give both the same version and the same parameters, or this one a `sensor` of "
+            "its own; it serves by itself when the other ends",
+        )
+    of = f" (serial {rival.serial})" if rival.serial else ""
     return SensorTaken(
         f"sensor {rival.sensor!r}{of} of station {rival.station!r} is already published by gateway "
         f"{rival.instance!r}{where}, session {rival.session_id:016x}",
@@ -235,7 +319,7 @@ def _taken(rival: SensorClaim) -> SensorTaken:
     )
 
 
-def _unknown(claim: SensorClaim) -> SensorTaken:
+def _unknown(claim: SensorClaim) -> ClaimedElsewhere:
     return SensorTaken(
         f"this gateway stood still, or has no link to the router: sensor {claim.sensor!r} may have "
         "been taken over by another one",

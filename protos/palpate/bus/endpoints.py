@@ -43,6 +43,13 @@ SIMULATE = Endpoint(
     codec.SIMULATION_REPLY,
     "indent the finite-element fingertip; several replies",
 )
+SIMULATE_AT = Endpoint(
+    "simulate",
+    codec.SIMULATION_REQUEST,
+    codec.SIMULATION_REPLY,
+    "the same of one replica of the finite-element service; several replies",
+    True,
+)
 CANCEL_SIMULATION = Endpoint(
     "simulate_cancel",
     codec.SIMULATION_CANCEL_REQUEST,

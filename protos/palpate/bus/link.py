@@ -6,6 +6,7 @@ import atexit
 import contextlib
 import json
 import re
+import secrets
 import threading
 import time
 import weakref
@@ -27,9 +28,19 @@ from palpate.bus.query import ask, ask_again, first_reply, no_reply, raise_error
 from palpate.bus.queryable import Queryable, QueryAnswer, single_reply
 from palpate.bus.ring import Alarm
 from palpate.bus.tap import Tap
-from palpate.bus.topics import MAX_MESSAGE_BYTES, Topic, caller_key, sensor_key, service_key
+from palpate.bus.topics import (
+    CLAIM_ROOT,
+    MAX_MESSAGE_BYTES,
+    SensorClaim,
+    Topic,
+    caller_key,
+    claims_key,
+    parse_claim_key,
+    sensor_key,
+    service_key,
+)
 from palpate.config import LinkConfig, check_name
-from palpate.errors import ConfigError, LinkError, PalpateError
+from palpate.errors import ConfigError, LinkError, PalpateError, WireError
 from palpate.process import Closing
 
 INDIRECT_WAIT_S = 60.0
@@ -37,6 +48,9 @@ INDIRECT_WAIT_S = 60.0
 
 _OBSERVER_WAIT_S = 1.0
 """How long a session that has joined looks for its router once more [s]."""
+
+_LOOK_S = 1.0
+"""How long a look at the tokens of others may take [s]."""
 
 _YOUNG_S = 2.0
 """Within this time the links of a session to all processes of its station have come up [s]."""
@@ -225,7 +239,7 @@ class Session(Closing):
         Raises:
             LinkError: No router within ``link.wait_for_router_s``, or a port is in use.
         """
-        raw = open_zenoh(link, "peer" if link.direct else "client")
+        raw = open_zenoh(link, "peer" if link.links_directly else "client")
         # Zenoh opens a peer at once and looks for the router in the background.
         if link.wait_for_router_s >= 0 and link.connect:
             deadline = time.monotonic() + link.wait_for_router_s
@@ -428,7 +442,8 @@ class Session(Closing):
                 everyone=True,
                 on_timings=on_timings,
             )
-            return first_reply(list(replies), lambda: self._no_reply(asking, key))
+            with contextlib.closing(replies):  # one that hangs does not delay those that answer
+                return first_reply(replies, lambda: self._no_reply(asking, key))
 
         return ask_again(once, timeout_s)
 
@@ -487,19 +502,42 @@ class Session(Closing):
         """Declare this process alive; call ``ready`` on the result when it serves."""
         return self._keep(Presence(self._raw, self.station, service, instance))
 
-    def claims(self, *, session_id: int, instance: str, lease_s: float) -> SensorClaims:
-        """Claims of the gateway ``instance`` on sensors of this station; see ``SensorClaims``."""
+    def claims(
+        self,
+        *,
+        session_id: int = 0,
+        instance: str,
+        lease_s: float,
+        root: str = CLAIM_ROOT,
+        shared: bool = False,
+    ) -> SensorClaims:
+        """Claims of the process ``instance`` at this station; see ``SensorClaims``.
+
+        ``session_id`` is that of its stamps; 0 = it makes none, and gets one by chance.
+        """
         info = self._raw.info
         return self._keep(
             SensorClaims(
                 self._raw,
                 self.station,
-                session_id=session_id,
+                session_id=session_id or secrets.randbelow(2**64 - 1) + 1,
                 instance=instance,
                 lease_s=lease_s,
+                root=root,
+                shared=shared,
                 joined=lambda: bool(info.routers_zid() or info.peers_zid()),
             )
         )
+
+    def holders(self, root: str, sensor: str) -> list[SensorClaim]:
+        """Who holds a claim on a sensor of this station, in order of their instances."""
+        key = claims_key(self.station, sensor, held_only=True, root=root)
+        found = []
+        for reply in self._asking().liveliness().get(key, timeout=_LOOK_S):
+            if reply.ok is not None:
+                with contextlib.suppress(WireError):  # anybody may declare tokens
+                    found.append(parse_claim_key(str(reply.ok.key_expr)))
+        return sorted(found, key=lambda one: one.instance)
 
     def alive(self, *, station: str | None = None) -> list[AliveService]:
         """Which processes are alive, and which of them are ready; complete as soon as it is open.
@@ -524,7 +562,7 @@ class Session(Closing):
         Raises:
             LinkError: There is no router.
         """
-        if not self._link.direct or not self._link.connect:
+        if not self._link.links_directly or not self._link.connect:
             return self
         with self._observing_lock:
             if self._observing is None:

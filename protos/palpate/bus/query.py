@@ -10,7 +10,7 @@ import queue
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -99,7 +99,7 @@ def ask(
     timeout_s: float,
     everyone: bool,
     on_timings: OnTimings | None = None,
-) -> Iterator[R | PalpateError]:
+) -> Generator[R | PalpateError]:
     """Replies to a query as they come; typed errors are yielded as exceptions, not raised.
 
     Closing the iterator cancels the query. All of it may take ``timeout_s``, and the service is
@@ -230,8 +230,8 @@ def _remote_error(error: zenoh.ReplyError, key: str, timeout_s: float) -> Palpat
     )
 
 
-def first_reply(replies: list[R | PalpateError], silence: Callable[[], PalpateError]) -> R:
-    """The first reply that is no error.
+def first_reply(replies: Iterator[R | PalpateError], silence: Callable[[], PalpateError]) -> R:
+    """The first reply that is no error; further ones are not waited for.
 
     Raises:
         PalpateError: All replies are errors; the first of them. Or that of ``silence``: there is

@@ -1,4 +1,9 @@
-"""The router: it introduces the processes of a station to one another."""
+"""The router: it introduces the processes of a station to one another, and joins it to a site.
+
+A site is a router that those of several stations connect up to. Streams cross only while somebody
+on the other side subscribes to them. At a site the name of a station belongs to one router: it
+claims the name, and a second one of that name does not connect until the first is gone.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +13,18 @@ import os
 import tempfile
 import threading
 from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import zenoh
 
 from palpate.bus.access import DOOR_PROTOCOL, DOOR_ROOT, ROLE_OF, log_refusals
-from palpate.bus.link import open_zenoh, zenoh_config
+from palpate.bus.claims import SensorClaims
+from palpate.bus.link import Session, open_zenoh, zenoh_config
+from palpate.bus.topics import STATION_ROOT
 from palpate.config import LinkConfig
+from palpate.errors import ClaimedElsewhere, LinkError
 from palpate.heartbeat import FILE_VARIABLE, beat
 from palpate.process import Closing
 
@@ -22,14 +32,39 @@ _log = logging.getLogger(__name__)
 
 _PERIOD_S = 0.5
 _ANSWER_S = 1.0
+_SITE_S = 2.0
+"""How long a starting router waits for the site, to learn whether its name is free [s]."""
+
+
+@dataclass(slots=True)
+class SiteLink:
+    """How a station's router connects up to a site, and what came of it.
+
+    Attributes:
+        connect: Endpoints of the site's router.
+        station: Name of the station, which is claimed there.
+        connected: Whether it is connected at present.
+        refusal: Why it does not connect: another station has this name; None = it may.
+    """
+
+    connect: tuple[str, ...]
+    station: str
+    connected: bool = False
+    refusal: ClaimedElsewhere | None = None
 
 
 def run_router(
-    listen: Sequence[str], stop: threading.Event, *, link: LinkConfig | None = None
+    listen: Sequence[str],
+    stop: threading.Event,
+    *,
+    link: LinkConfig | None = None,
+    site: SiteLink | None = None,
 ) -> None:
     """Run the router at endpoints, e.g. ``("tcp/127.0.0.1:7447",)``, until ``stop`` is set.
 
-    Lease and certificates are those of ``link``; None = defaults.
+    Lease and certificates are those of ``link``; None = defaults. With ``site`` it connects up,
+    unless another station has its name there. To begin or to end that, it is opened again: the
+    links of its station are back within two seconds.
 
     Raises:
         LinkError: A port is in use.
@@ -38,6 +73,19 @@ def run_router(
     config = LinkConfig(connect=(), listen=tuple(listen), lease_s=base.lease_s, tls=base.tls)
     if config.has_roles:
         log_refusals()
+    with ExitStack() as stack:
+        guard = None if site is None else stack.enter_context(_NameGuard(site, config))
+        if guard is not None:
+            guard.wait(stop)
+        while not stop.is_set():
+            _run_once(config, stop, guard)
+
+
+def _run_once(config: LinkConfig, stop: threading.Event, guard: _NameGuard | None) -> None:
+    """Run until ``stop`` is set, or until whether to connect up changes."""
+    connects = guard is not None and guard.may_connect()
+    if guard is not None and connects:
+        config = config.model_copy(update={"connect": guard.site.connect})
     # Beside its heartbeat, where its supervisor clears up after a router that is killed.
     beside = os.path.dirname(os.environ.get(FILE_VARIABLE, "")) or None
     with tempfile.TemporaryDirectory(prefix="palpate-router-", dir=beside) as folder:
@@ -48,8 +96,71 @@ def run_router(
                 while not stop.wait(_PERIOD_S):
                     if visitor.is_answered():
                         beat()
+                    if guard is not None:
+                        guard.site.connected = bool(raw.info.routers_zid())
+                        if guard.may_connect() != connects:
+                            return
         finally:
             raw.close()
+
+
+class _NameGuard(Closing):
+    """Claims the name of a station at a site, as a client of the site's router."""
+
+    def __init__(self, site: SiteLink, config: LinkConfig) -> None:
+        self.site = site
+        update = {"connect": site.connect, "listen": (), "direct": False}
+        self._link = config.model_copy(update={**update, "wait_for_router_s": _ANSWER_S})
+        self._claims: SensorClaims | None = None
+        self._closed = threading.Event()
+        # A client cannot open without its router, which may be away for long.
+        self._thread = threading.Thread(target=self._run, name="name at the site", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._closed.is_set():
+            try:
+                session = Session.open(self._link, station=self.site.station)
+            except LinkError:
+                self._closed.wait(_PERIOD_S)
+                continue
+            with session:
+                claims = session.claims(
+                    instance=_ROUTER, lease_s=self._link.lease_s, root=STATION_ROOT
+                )
+                claims.want(_ROUTER)
+                self._claims = claims
+                self._closed.wait()
+
+    def wait(self, stop: threading.Event) -> None:
+        """Wait until it is known whether the name is free, or the site does not answer."""
+        for _ in range(round(_SITE_S / _LOOK_S)):
+            held = self._claims is not None and self._claims.holds(_ROUTER)
+            if held or not self.may_connect() or stop.wait(_LOOK_S):
+                return
+
+    def may_connect(self) -> bool:
+        """Whether no other station of this name is known; writes into the log when that changes."""
+        if self._claims is None:
+            return True
+        self._claims.holds(_ROUTER)
+        refusal = self._claims.refusal(_ROUTER)
+        if refusal is not None and self.site.refusal is None:
+            _log.error("%s", refusal)
+        elif refusal is None and self.site.refusal is not None:
+            _log.warning("the name %s is free again: connecting to the site", self.site.station)
+        self.site.refusal = refusal
+        return refusal is None
+
+    def close(self) -> None:
+        """Withdraw the claim."""
+        self._closed.set()
+        self._thread.join(_CLOSE_S)
+
+
+_ROUTER = "router"
+_LOOK_S = 0.05
+_CLOSE_S = 5.0
 
 
 class _GuestLog(Closing):

@@ -8,6 +8,8 @@ Keys (docs/adr/0004-keys-and-qos.md)::
     palpate/@v1/@asking/<station>/<digest of a request's id>          a caller that waits (token)
     palpate/@v1/@sensor/<station>/<sensor>/<wanted|held>/<since>/<session>/<instance>/<host>/<serial>
                                                                      a gateway's claim (token)
+    palpate/@v1/@duty/<duty>/<station>/<sensor>/<wanted|held>/...    a service's claim (token)
+    palpate/@v1/@station/<station>/router/<wanted|held>/...          a router's claim (token)
 
 ``@v1`` is a verbatim chunk: ``*`` and ``**`` never match it, so a future contract cannot be taken
 for this one by accident.
@@ -35,6 +37,8 @@ ROOT = f"palpate/@v{CONTRACT_VERSION}"
 LIVE_ROOT = f"{ROOT}/@live"
 ASKING_ROOT = f"{ROOT}/@asking"
 CLAIM_ROOT = f"{ROOT}/@sensor"
+DUTY_ROOT = f"{ROOT}/@duty"
+STATION_ROOT = f"{ROOT}/@station"
 ENCODING_PREFIX = "application/protobuf;"
 
 MAX_MESSAGE_BYTES = 4 << 20
@@ -170,22 +174,31 @@ def caller_key(station: str, request_id: str) -> str:
     return f"{ASKING_ROOT}/{_chunks(station=station)}/{digest}"
 
 
+def duty_root(duty: str) -> str:
+    """Root of the claims on what services do for a sensor: a topic or ``simulate``."""
+    return f"{DUTY_ROOT}/{check_name(duty, 'duty')}"
+
+
 @dataclass(frozen=True, slots=True)
 class SensorClaim:
     """A gateway's claim on the key of a sensor: only the gateway that holds it publishes there.
+
+    Services claim in the same way what they do for a sensor, and routers the name of their station.
 
     A frame may arrive before the token that announces its session. While the serial number becomes
     known there are two tokens of one session; the older is withdrawn after the newer is declared.
 
     Attributes:
         station: Station of the sensor.
-        sensor: Its name in keys.
+        sensor: Its name in keys; ``router`` in a claim on a station's name.
         session_id: Run of the gateway, as in ``Stamp.session_id``; never 0.
         held: Whether it publishes; else it waits, or is about to take over.
         since_wall_ns: Wall clock when it came into this state [ns since the Unix epoch].
         instance: Name of the gateway among several.
         host: Name of its host; empty = unknown.
-        serial: Serial number of the sensor; empty = not opened yet.
+        serial: Serial number of the sensor; empty = not opened yet. Of a service, the digest of
+            what its answers depend on.
+        root: What is claimed: ``CLAIM_ROOT``, a ``duty_root`` or ``STATION_ROOT``.
     """
 
     station: str
@@ -196,6 +209,7 @@ class SensorClaim:
     instance: str = "gateway"
     host: str = ""
     serial: str = ""
+    root: str = CLAIM_ROOT
 
     @property
     def order(self) -> tuple[bool, int, int]:
@@ -213,13 +227,15 @@ def claim_key(claim: SensorClaim) -> str:
     state = "held" if claim.held else "wanted"
     numbers = f"{claim.since_wall_ns:016x}/{claim.session_id:016x}"
     texts = f"{_hidden(claim.host)}/{_hidden(claim.serial)}"
-    return f"{CLAIM_ROOT}/{names}/{state}/{numbers}/{_chunks(instance=claim.instance)}/{texts}"
+    return f"{claim.root}/{names}/{state}/{numbers}/{_chunks(instance=claim.instance)}/{texts}"
 
 
-def claims_key(station: str, sensor: str = "*", *, held_only: bool = False) -> str:
+def claims_key(
+    station: str, sensor: str = "*", *, held_only: bool = False, root: str = CLAIM_ROOT
+) -> str:
     """Key that matches all claims on a sensor; ``"*"`` for any station or sensor."""
     names = _chunks(station=station, sensor=sensor)
-    return f"{CLAIM_ROOT}/{names}/{'held' if held_only else '*'}/*/*/*/*/*"
+    return f"{root}/{names}/{'held' if held_only else '*'}/*/*/*/*/*"
 
 
 def parse_claim_key(key: str) -> SensorClaim:
@@ -229,9 +245,8 @@ def parse_claim_key(key: str) -> SensorClaim:
         WireError: It is not such a key (reason ``"key"``).
     """
     try:
-        if not key.startswith(f"{CLAIM_ROOT}/"):
-            raise ValueError("another root")
-        chunks = key.removeprefix(f"{CLAIM_ROOT}/").split("/")
+        root = _claim_root(key)
+        chunks = key.removeprefix(f"{root}/").split("/")
         station, sensor, state, since, session, instance, host, serial = chunks
         claim = SensorClaim(
             check_name(station, "station"),
@@ -242,6 +257,7 @@ def parse_claim_key(key: str) -> SensorClaim:
             check_name(instance, "instance"),
             _shown(host),
             _shown(serial),
+            root,
         )
         if claim_key(claim) != key or claim.session_id <= 0 or claim.since_wall_ns < 0:
             raise ValueError("not as claim_key writes it")
@@ -252,6 +268,15 @@ def parse_claim_key(key: str) -> SensorClaim:
             reason="key",
         ) from error
     return claim
+
+
+def _claim_root(key: str) -> str:
+    for root in (CLAIM_ROOT, STATION_ROOT):
+        if key.startswith(f"{root}/"):
+            return root
+    if key.startswith(f"{DUTY_ROOT}/"):
+        return duty_root(key.removeprefix(f"{DUTY_ROOT}/").partition("/")[0])
+    raise ValueError("another root")
 
 
 def _hidden(text: str) -> str:

@@ -31,7 +31,13 @@ from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, WRENCH, T
 from palpate.census import ProcessReport, take_census
 from palpate.client.estimates import OnSynthesis, ask_basis, ask_synthesis, ask_tare, ask_zero
 from palpate.client.robot_poses import RobotPosePublisher
-from palpate.client.simulations import GRACE_S, OnProgress, OnStep, ask_simulation
+from palpate.client.simulations import (
+    GRACE_S,
+    OnProgress,
+    OnStep,
+    ask_cancellation,
+    ask_simulation,
+)
 from palpate.client.streams import Stream
 from palpate.config import (
     STATION_VARIABLE,
@@ -52,7 +58,6 @@ from palpate.messages import (
     ModeBasis,
     ModelMetadata,
     ServiceRequest,
-    SimulationCancelRequest,
     SimulationReply,
     SimulationRequest,
     Status,
@@ -381,6 +386,9 @@ class Client(Closing):
     ) -> SimulationReply:
         """Indent the finite-element fingertip.
 
+        Any service that serves ``sensor`` may answer. If it ends, hangs or has no room, another one
+        is asked for all of it again, within ``timeout_s``; each step is told once.
+
         Args:
             request: What to simulate; ``palpate.client.simulations.straight_path`` makes paths.
             sensor: Name under which the service serves.
@@ -412,12 +420,7 @@ class Client(Closing):
         Returns:
             Whether it was waiting or running.
         """
-        return self.session.query(
-            endpoints.CANCEL_SIMULATION,
-            SimulationCancelRequest(request_id),
-            sensor=sensor,
-            timeout_s=timeout_s,
-        ).found
+        return ask_cancellation(self.session, request_id, sensor=sensor, timeout_s=timeout_s)
 
     def model(self, *, service: str = "features") -> ModelMetadata:
         """Description of the served bundle."""

@@ -1,15 +1,31 @@
-"""Requests of simulations: straight paths, and the parts of the answer joined into one reply."""
+"""Requests of simulations: straight paths, and the parts of the answer joined into one reply.
+
+Several finite-element services may answer under one name. A simulation is a pure function of its
+request, so what one of them does not finish is asked of another.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+import random
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from palpate.bus import Session, endpoints
-from palpate.errors import WireError
+from palpate.bus.topics import duty_root
+from palpate.config import check_name
+from palpate.errors import (
+    ErrorCode,
+    LinkError,
+    PalpateError,
+    RemoteError,
+    ReplicaDiffers,
+    WireError,
+)
 from palpate.messages import (
     Pose,
+    SimulationCancelRequest,
     SimulationProgress,
     SimulationReply,
     SimulationRequest,
@@ -67,20 +83,116 @@ def ask_simulation(
     ``timeout_s``. While this call waits, a token on the bus shows it. If this process ends or is
     interrupted, the token vanishes and the service stops the simulation.
 
+    The answer of a service that is killed, stopped or cut off ends, at the latest after the lease
+    of its link (2 s); then another one is asked, and also when one has no room. When none is left,
+    the error of the last one is raised.
+
     Raises:
         LinkError: No finite-element service runs.
         RemoteError: It refuses, or cannot go on. Steps that had converged were given to
             ``on_step``.
+        ReplicaDiffers: One ended, and another would answer for another fingertip.
         StreamTimeout: No answer within ``GRACE_S`` after the deadline.
         WireError: The request, or an answer, breaks the contract.
     """
+    check_name(sensor, "sensor")
     deadline_s = min(request.deadline_s or math.inf, timeout_s)
-    asked = dataclasses.replace(request, deadline_s=deadline_s)
+    end_s = time.monotonic() + deadline_s
+    once = _StepsOnce(on_step)
+    asked: set[str] = set()
+    error: PalpateError | None = None
     with session.caller_token(request.request_id):
-        parts = session.query_stream(
-            endpoints.SIMULATE, asked, sensor=sensor, timeout_s=deadline_s + GRACE_S
+        while True:
+            replica = _next_replica(session, sensor, asked)
+            left_s = end_s - time.monotonic()
+            if error is not None and (replica is None or left_s <= 0.0):
+                raise error
+            again = dataclasses.replace(request, deadline_s=left_s)
+            wait_s = left_s + GRACE_S
+            # A service of an older palpate has no key of its own.
+            parts = (
+                session.query_stream(endpoints.SIMULATE, again, sensor=sensor, timeout_s=wait_s)
+                if replica is None
+                else session.query_stream(
+                    endpoints.SIMULATE_AT, again, service="fem", instance=replica, timeout_s=wait_s
+                )
+            )
+            try:
+                return join(once.watch(parts), on_progress=on_progress, on_step=once.take)
+            except (LinkError, RemoteError, WireError) as failure:
+                if replica is None or not _may_ask_another(failure):
+                    raise
+                error = failure
+
+
+def _next_replica(session: Session, sensor: str, asked: set[str]) -> str | None:
+    """A service that answers for ``sensor`` and is not in ``asked``, by chance; it is added."""
+    left = {one.instance for one in session.holders(duty_root("simulate"), sensor)} - asked
+    if not left:
+        return None
+    chosen = random.choice(sorted(left))
+    asked.add(chosen)
+    return chosen
+
+
+def _may_ask_another(error: PalpateError) -> bool:
+    if isinstance(error, RemoteError):
+        return error.code in (ErrorCode.RESOURCE_EXHAUSTED, ErrorCode.UNAVAILABLE)
+    return isinstance(error, LinkError) or getattr(error, "reason", "") == "incomplete"
+
+
+class _StepsOnce:
+    """Tells each step once, although a second service begins again with the first."""
+
+    def __init__(self, on_step: OnStep | None) -> None:
+        self._on_step = on_step
+        self._told = 0
+        self._mesh = b""
+
+    def watch(self, parts: Iterable[SimulationReply]) -> Iterator[SimulationReply]:
+        """The same parts, which must be of the fingertip that others were of."""
+        for part in parts:
+            if self._mesh and part.mesh_sha256 not in (b"", self._mesh):
+                raise ReplicaDiffers(
+                    f"the service that began had the mesh {self._mesh.hex()[:12]}, and the one "
+                    f"that took over has {part.mesh_sha256.hex()[:12]}",
+                    remedy="give all of them the same version and parameters: palpate fleet",
+                )
+            self._mesh = part.mesh_sha256 or self._mesh
+            yield part
+
+    def take(self, number: int, step: SimulationStep) -> None:
+        """A step of the service that answers now."""
+        if number >= self._told:
+            self._told = number + 1
+            if self._on_step is not None:
+                self._on_step(number, step)
+
+
+def ask_cancellation(session: Session, request_id: str, *, sensor: str, timeout_s: float) -> bool:
+    """Stop a simulation, whichever service computes it; whether one did.
+
+    Raises:
+        PalpateError: None answers.
+    """
+    check_name(sensor, "sensor")
+    replies = session.query_all(
+        endpoints.CANCEL_SIMULATION,
+        SimulationCancelRequest(request_id),
+        sensor=sensor,
+        timeout_s=timeout_s,
+    )
+    answers = [reply for reply in replies if not isinstance(reply, PalpateError)]
+    if not answers:
+        raise (
+            replies[0]
+            if replies and isinstance(replies[0], PalpateError)
+            else LinkError(
+                f"no service simulates for {sensor!r}",
+                remedy="start the service: palpate up; see what runs: palpate status",
+            )
         )
-        return join(parts, on_progress=on_progress, on_step=on_step)
+    return any(answer.found for answer in answers)
 
 
 def join(

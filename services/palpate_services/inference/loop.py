@@ -22,6 +22,7 @@ import numpy as np
 from palpate import clock
 from palpate.admin import make_token, token_file
 from palpate.bus import Delivery, Publisher, ReceivedMessage, Session, Subscriber, endpoints
+from palpate.bus.claims import SETTLE_S
 from palpate.bus.link import LOSSLESS_STALL_S
 from palpate.bus.topics import Topic
 from palpate.codec import STAGE_TIMINGS
@@ -38,6 +39,7 @@ from palpate_services.inference.model import BATCH_MOST, Runtime
 from palpate_services.inference.remembered import RememberedFile
 from palpate_services.inference.repository import Repository
 from palpate_services.inference.served import ServedModels, show, take_commands
+from palpate_services.inference.standby import Duty
 
 _log = logging.getLogger(__name__)
 
@@ -184,7 +186,8 @@ class EstimatePublisher(Generic[M, E]):
     """Publishes an estimate for each message, or counts why there is none. Use from one thread.
 
     ``health`` gets counters and gauges; ``models`` are the bundles and ``estimation`` how they are
-    used; ``rate_hz`` limits the estimates a second and sensor [Hz], None = no limit.
+    used; ``rate_hz`` limits the estimates a second and sensor [Hz], None = no limit. ``duty`` says
+    which sensors it publishes for, and for which it stands by; None = all.
     """
 
     def __init__(
@@ -197,8 +200,10 @@ class EstimatePublisher(Generic[M, E]):
         estimation: Estimation[M, E],
         *,
         rate_hz: float | None = None,
+        duty: Duty | None = None,
     ) -> None:
         self._route = route
+        self._duty = duty
         self._session = session
         self._health = health
         self._models = models
@@ -242,6 +247,8 @@ class EstimatePublisher(Generic[M, E]):
                 sample = self._sample(received, runtime)
                 if isinstance(sample, EstimateRefusal):
                     self._refuse(received, sample.value, runtime)
+                elif runtime is not None and self._stands_by(sensor, runtime):
+                    self._counts["standby"] += 1
                 elif runtime is not None:
                     taken = _Taken(received, sample, taken_ns, time.monotonic_ns())
                     samples.setdefault(runtime, []).append(taken)
@@ -280,6 +287,13 @@ class EstimatePublisher(Generic[M, E]):
         if runtime is None:
             return EstimateRefusal.NO_MODEL
         return self._estimation.sample(received.sensor, received.message, runtime)
+
+    def _stands_by(self, sensor: str, runtime: Runtime) -> bool:
+        """Whether another service publishes the estimates of a sensor, or may do so."""
+        if self._duty is None:
+            return False
+        self._duty.take(sensor, runtime)
+        return not self._duty.holds(sensor)
 
     def _run(self, runtime: Runtime, taken: Sequence[_Taken[M]]) -> None:
         """Run a model on samples, and publish the estimates or count why there are none."""
@@ -346,6 +360,8 @@ class EstimatePublisher(Generic[M, E]):
         for sensor in [sensor for sensor in self._publishers if sensor not in self._used]:
             self._publishers.pop(sensor).close()
             self._rate_limit.forget(sensor)
+            if self._duty is not None:
+                self._duty.release(sensor)
             self._health.set_sensors(tuple(sorted(self._publishers)))
         self._used.clear()
 
@@ -364,6 +380,8 @@ class EstimatePublisher(Generic[M, E]):
             self._gauged_ns = now_ns
             self._health.gauge("busy_ratio", self._busy_ns / max(period_ns, 1))
             self._busy_ns = 0
+            if self._duty is not None and not last:
+                self._duty.report()
             if self._latencies_ns:
                 p50, p99 = np.percentile(self._latencies_ns, (50, 99)) * 1e-9
                 self._health.gauge("latency_p50_s", float(p50))
@@ -447,8 +465,12 @@ def serve(
         )
         take_commands(session, models, health, token)
         estimation = prepare(session, models, health)
+        # A lossless replay is one run with one service, which must miss no frame.
+        duty = None
+        if config.delivery != "every":
+            duty = Duty(session, route.target.name, health, lease_s=link.lease_s)
         publisher = EstimatePublisher(
-            route, session, config, health, models, estimation, rate_hz=rate_hz
+            route, session, config, health, models, estimation, rate_hz=rate_hz, duty=duty
         )
         messages = session.subscriber(
             route.source,
@@ -464,6 +486,8 @@ def serve(
         with HealthReporter(session, health, refresh=refresh):
             show(models, health)
             avoid_pauses()
+            if duty is not None:
+                stop.wait(SETTLE_S)  # by then the claims of others are known
             # Ready only now: clients that wait for readiness must find subscriptions and endpoints.
             presence.ready()
             while not stop.is_set():
@@ -481,6 +505,8 @@ def serve(
                 publisher.take(left)
             messages.close()
             publisher.report(last=True)
+            if duty is not None:
+                duty.close()
 
 
 def _models(

@@ -1,0 +1,202 @@
+"""Write docs/results/fleet.md, and the table in docs/fleet.md, from docs/results/fleet.json.
+
+``python docs/make_fleet.py``          writes both
+``python docs/make_fleet.py --check``  exits 1 if they are not what the file says
+
+``palpate bench fleet --out docs/results/fleet.json``, as root, measures everything anew.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+DOCS = Path(__file__).parent
+FILE = DOCS / "results" / "fleet.json"
+RESULTS = DOCS / "results" / "fleet.md"
+PAGE = DOCS / "fleet.md"
+BEGIN, END = "<!-- written by docs/make_fleet.py -->", "<!-- end -->"
+SHARE = 0.5
+"""Share of one core that the site's router may take in the plan."""
+
+PHASES = {
+    "nobody": "nobody",
+    "features": "estimates of every station",
+    "electrodes": "raw frames of every station",
+}
+FAULTS = {"kill": "killed", "stop": "stopped (SIGSTOP)", "cut": "cable pulled"}
+
+
+def _table(columns: str, rows: Iterable[Iterable[str]]) -> str:
+    heads = [column.strip() for column in columns.split("|")]
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _per_station(scale: list[dict[str, Any]], phase: str, value: str) -> float:
+    """Growth with each station: of the largest fleet against the smallest."""
+    first, last = scale[0], scale[-1]
+    grown = last["phases"][phase][value] - first["phases"][phase][value]
+    return float(grown / (last["stations"] - first["stations"]))
+
+
+def results_page(values: Mapping[str, Any]) -> str:
+    """The whole page of results."""
+    scale, machine = values["scale"], values["machine"]
+    rows = [
+        [
+            str(one["stations"]),
+            PHASES[phase],
+            f"{of['bytes_hz_each'] / 1e3:.1f}",
+            f"{100 * of['site_cpu_ratio']:.1f}",
+            f"{of['site_rss_bytes'] / 1e6:.0f}",
+            f"{100 * of['station_router_cpu_ratio']:.1f}",
+            f"{1e3 * of['p50_s']:.2f}, {1e3 * of['p99_s']:.1f}" if "p50_s" in of else "-",
+            f"{of['lost']} of {of['received'] + of['lost']}" if "lost" in of else "-",
+        ]
+        for one in scale
+        for phase, of in one["phases"].items()
+    ]
+    floors = [
+        [
+            str(one["stations"]),
+            f"{1e3 * one['floor']['p50_s']:.2f}, {1e3 * one['floor']['p99_s']:.1f}",
+            f"{one['phases']['electrodes']['p50_s'] / one['floor']['p50_s']:.2f}",
+            f"{one['phases']['electrodes']['p99_s'] / one['floor']['p99_s']:.2f}",
+        ]
+        for one in scale
+    ]
+    whole = [
+        [name, f"{100 * one['cpu_ratio']:.1f}", f"{one['rss_bytes'] / 1e6:.0f}"]
+        for name, one in values["station"].items()
+    ]
+    impaired = [
+        [
+            one["netem"],
+            one.get("not_measured")
+            or f"p50 {1e3 * one['p50_s']:.1f} ms, p99 {1e3 * one['p99_s']:.1f} ms, "
+            f"lost {one['lost']} of {one['received'] + one['lost']}",
+        ]
+        for one in values["impaired"]
+    ]
+    takeovers = [
+        [
+            FAULTS[one["fault"]],
+            "-" if one["gap_s"] is None else f"{one['gap_s']:.2f}",
+            str(one["twice"]),
+            str(one["out_of_order"]),
+        ]
+        for one in sorted(
+            values.get("takeovers", []), key=lambda one: [*FAULTS].index(one["fault"])
+        )
+    ]
+    asked = [
+        [FAULTS[one["fault"]], f"{one['after_s']:.2f}", one["outcome"]]
+        for one in sorted(
+            values.get("asked_again", []), key=lambda one: [*FAULTS].index(one["fault"])
+        )
+    ]
+    return f"""# Fleets: what stations behind a site's router cost
+
+<!-- Written by docs/make_fleet.py from fleet.json; do not edit. -->
+Measured by `palpate bench fleet --out docs/results/fleet.json`, as root: every station, the site
+and the consumer is a network namespace of one host, joined by virtual cables (veth), with mutual
+TLS. All of them share
+{machine["cpus"]} cores ({machine["cpu"]}; load {
+        machine["load_1min"]
+    } at the end), so that latencies of
+many stations are those of a full host, not of a network. How to use these numbers:
+[fleet.md](../fleet.md).
+
+## What crosses, and what it costs
+
+A station is its own router and one process that publishes frames and estimates of one finger at
+100 Hz each. "Listens": what one consumer at the site subscribes to. kB/s are of one station's
+cable, both ways, with all framing. Latency is from the stamp to the consumer, through both routers.
+
+{
+        _table(
+            "stations | listens | kB/s each | site router, % of a core | MB | station's router, %"
+            " | p50, p99 ms | lost",
+            rows,
+        )
+    }
+The floor is the same process with a consumer that is linked to it directly, over one cable and
+without a router, at the same time.
+
+{_table("stations | floor p50, p99 ms | raw frames: times the floor's p50 | p99", floors)}
+## A whole station
+
+Router, gateway of one virtual finger and features service, each a process.
+
+{_table("process | % of a core | MB", whole)}
+## Delay and loss on the cable
+
+{_table("tc netem | what one consumer of one station saw", impaired)}
+## A standby takes over
+
+Two features services on two hosts serve one finger; the host of the active one fails. The gap is
+the longest pause between estimates at a consumer, one trial a line; "twice" are estimates of one
+frame that came from both, until 8 s after the fault was over. A subscriber of palpate drops and
+counts those; this consumer took what crossed the cable.
+
+{_table("the active one is | gap, s | twice | out of order", takeovers)}
+## A simulation is asked again
+
+Two finite-element services on two hosts; the one that computes fails. The time is until the other
+one has taken the same request.
+
+{_table("the one that computes is | after, s | outcome", asked)}"""
+
+
+def plan_table(values: Mapping[str, Any]) -> str:
+    """How many stations one site's router carries."""
+    scale = values["scale"]
+    rows = []
+    for phase, words in PHASES.items():
+        cpu = _per_station(scale, phase, "site_cpu_ratio")
+        memory = _per_station(scale, phase, "site_rss_bytes")
+        rate = median(one["phases"][phase]["bytes_hz_each"] for one in scale)
+        most = f"{SHARE / cpu:.0f}" if cpu > 1e-4 else "more than measured"
+        rows.append([words, f"{rate / 1e3:.1f}", f"{100 * cpu:.2f}", f"{memory / 1e6:.2f}", most])
+    return _table(
+        "one consumer listens to | kB/s a station | site router, % of a core a station"
+        f" | MB a station | stations at {100 * SHARE:.0f} % of a core",
+        rows,
+    )
+
+
+def page_with(text: str, table: str) -> str:
+    """The planning page with its table."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return f"{before}{BEGIN}\n\n{table}\n{END}{after}"
+
+
+def main() -> int:
+    """Write or check."""
+    values = json.loads(FILE.read_text(encoding="utf-8"))
+    wanted = {
+        RESULTS: results_page(values).rstrip() + "\n",
+        PAGE: page_with(PAGE.read_text(encoding="utf-8"), plan_table(values)),
+    }
+    if "--check" not in sys.argv:
+        for path, text in wanted.items():
+            path.write_text(text, encoding="utf-8")
+        return 0
+    stale = [
+        path.name
+        for path, text in wanted.items()
+        if not path.exists() or path.read_text(encoding="utf-8") != text
+    ]
+    if stale:
+        sys.stderr.write(f"{', '.join(stale)}: not as fleet.json says; run docs/make_fleet.py\n")
+    return 1 if stale else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,214 @@
+"""Several finite-element services under one key: any may answer, and none answers otherwise."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from palpate.bus import Session
+from palpate.bus.topics import duty_root
+from palpate.client import Client
+from palpate.config import LinkConfig, parse_config
+from palpate.errors import LinkError, PalpateError, RemoteError
+from palpate.messages import ServiceState, SimulationOutcome, SimulationReply
+from palpate_fem.service import node
+from palpate_fem.service.config import FemConfig
+
+fakes: Any = importlib.import_module("fem_fakes")
+
+PATIENCE_S = 60.0
+FAKES = {"factory": "fem_fakes:make", "workers": 1, "waiting": 0, "grace_s": 0.3, "threads": 1}
+STEPS = 40
+
+CHILD = """
+import sys, threading
+from palpate.config import LinkConfig, parse_config
+from palpate_fem.service import node
+from palpate_fem.service.config import FemConfig
+endpoint, instance = sys.argv[1:]
+values = {"factory": "fem_fakes:make", "workers": 1, "waiting": 0, "grace_s": 0.3, "threads": 1}
+config = parse_config(FemConfig, values, where="test")
+node.run(config, LinkConfig(connect=(endpoint,)), "lab", threading.Event(), instance=instance)
+"""
+
+
+def until(true: Callable[[], Any]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < deadline, "it did not become true in time"
+        time.sleep(0.05)
+
+
+def holders(session: Session) -> list[str]:
+    return [one.instance for one in session.holders(duty_root("simulate"), "twin")]
+
+
+@contextlib.contextmanager
+def child(link: LinkConfig, instance: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A replica in a process of its own, which can be killed and stopped."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", CHILD, link.connect[0], instance], start_new_session=True
+    )
+    try:
+        with Session.open(link) as session:
+            until(lambda: instance in holders(session))
+            until(lambda: any(a.instance == instance and a.ready for a in session.alive()))
+        yield process
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@contextlib.contextmanager
+def thread(link: LinkConfig, instance: str, **values: Any) -> Iterator[None]:
+    stop = threading.Event()
+    config = parse_config(FemConfig, {**FAKES, **values}, where="test")
+    running = threading.Thread(
+        target=node.run, args=(config, link, "lab", stop), kwargs={"instance": instance}
+    )
+    running.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        running.join(PATIENCE_S)
+    assert not running.is_alive()
+
+
+class Asked:
+    """A simulation of many slow steps, in a thread."""
+
+    def __init__(self, robot: Client, name: str) -> None:
+        self.steps: list[int] = []
+        self.answer: list[SimulationReply | PalpateError] = []
+        self.begun = threading.Event()
+        self._request = fakes.request(name, fakes.SLOW, steps=STEPS)
+        self._robot = robot
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            reply = self._robot.simulate(
+                self._request,
+                timeout_s=PATIENCE_S,
+                on_step=lambda number, _: self._step(number),
+            )
+        except PalpateError as error:
+            self.answer.append(error)
+        else:
+            self.answer.append(reply)
+
+    def _step(self, number: int) -> None:
+        self.steps.append(number)
+        self.begun.set()
+
+    def wait(self) -> SimulationReply | PalpateError:
+        self._thread.join(3 * PATIENCE_S)
+        return self.answer[0]
+
+
+def busy(robot: Client, instance: str) -> bool:
+    return any(
+        one.instance == instance and one.gauges.get("busy_workers", 0.0) > 0
+        for one in robot.status()
+    )
+
+
+@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
+def test_what_one_does_not_finish_another_does(own_bus: LinkConfig, fault: signal.Signals) -> None:
+    """The caller sees each step once, and a whole answer."""
+    with contextlib.ExitStack() as stack:
+        replicas = {name: stack.enter_context(child(own_bus, name)) for name in ("fem-a", "fem-b")}
+        robot = stack.enter_context(Client(own_bus.connect[0], timeout_s=10))
+        asked = Asked(robot, "failover")
+        assert asked.begun.wait(PATIENCE_S)
+        until(lambda: any(busy(robot, name) for name in replicas))
+        (victim,) = (name for name in replicas if busy(robot, name))
+        # Its workers go with it: it is the process that is lost, or the whole host that stops.
+        os.killpg(replicas[victim].pid, fault)
+        reply = asked.wait()
+        assert isinstance(reply, SimulationReply), reply
+        assert reply.outcome is SimulationOutcome.COMPLETE
+        assert asked.steps == list(range(STEPS))
+        # The next question does not go to the one that is gone.
+        began_s = time.monotonic()
+        again = robot.simulate(fakes.request("next"), timeout_s=PATIENCE_S)
+        assert again.outcome is SimulationOutcome.COMPLETE
+        assert time.monotonic() - began_s < PATIENCE_S
+        if fault == signal.SIGSTOP:
+            os.killpg(replicas[victim].pid, signal.SIGCONT)
+
+
+def test_the_last_one_that_dies_ends_the_question_with_a_typed_error(own_bus: LinkConfig) -> None:
+    with contextlib.ExitStack() as stack:
+        replica = stack.enter_context(child(own_bus, "fem-a"))
+        robot = stack.enter_context(Client(own_bus.connect[0], timeout_s=10))
+        asked = Asked(robot, "lonely")
+        assert asked.begun.wait(PATIENCE_S)
+        os.killpg(replica.pid, signal.SIGKILL)
+        assert isinstance(asked.wait(), PalpateError)
+        with pytest.raises(LinkError):
+            robot.simulate(fakes.request("nobody"), timeout_s=10.0)
+
+
+def test_one_that_is_full_is_not_the_last_that_is_asked(own_bus: LinkConfig) -> None:
+    """Two with one worker each and no queue take two at once; a third is refused by both."""
+    with (
+        thread(own_bus, "fem-a"),
+        thread(own_bus, "fem-b"),
+        Client(own_bus.connect[0], timeout_s=10) as robot,
+    ):
+        until(lambda: holders(robot.session) == ["fem-a", "fem-b"])
+        until(lambda: sum(a.service == "fem" and a.ready for a in robot.alive()) == 2)
+        first = Asked(robot, "first")
+        assert first.begun.wait(PATIENCE_S)
+        second = Asked(robot, "second")
+        assert second.begun.wait(PATIENCE_S)
+        with pytest.raises(RemoteError, match="wait"):
+            robot.simulate(fakes.request("third"), timeout_s=10.0)
+        for name in ("first", "second"):  # whichever of the two computes it
+            assert robot.cancel_simulation(name)
+        assert not robot.cancel_simulation("never asked")
+        for asked in (first, second):
+            reply = asked.wait()
+            assert isinstance(reply, SimulationReply)
+            assert reply.outcome is SimulationOutcome.CANCELLED
+
+
+def test_a_replica_with_other_parameters_does_not_answer(own_bus: LinkConfig) -> None:
+    with (
+        Client(own_bus.connect[0], timeout_s=10) as robot,
+        contextlib.ExitStack() as first,
+        contextlib.ExitStack() as second,
+    ):
+        first.enter_context(thread(own_bus, "fem-a"))
+        until(lambda: holders(robot.session) == ["fem-a"])
+        until(lambda: any(a.instance == "fem-a" and a.ready for a in robot.alive()))
+        second.enter_context(thread(own_bus, "fem-b", fingertip={"shear_modulus_pa": 3.0e5}))
+
+        def other() -> Any:
+            return next((one for one in robot.status() if one.instance == "fem-b"), None)
+
+        until(lambda: (found := other()) and found.state is ServiceState.DEGRADED)
+        assert "would answer otherwise" in other().last_error.message
+        for number in range(5):
+            robot.simulate(fakes.request(f"asked {number}"), timeout_s=PATIENCE_S)
+        assert holders(robot.session) == ["fem-a"]
+        assert not other().counters.get("requests_received")
+        # It takes the key when nobody else answers there.
+        first.close()
+        until(lambda: holders(robot.session) == ["fem-b"])
+        until(lambda: (found := other()) and found.state is ServiceState.READY)
+        robot.simulate(fakes.request("the other"), timeout_s=PATIENCE_S)
+        assert other().counters.get("requests_received") == 1
