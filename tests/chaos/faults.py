@@ -15,10 +15,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 from tests.chaos.station import (
     CABLE,
+    FOLDER,
     ROUTER,
     SENSOR,
     SOLVER,
@@ -130,9 +130,9 @@ def _stranger(station: ChaosStation, what: str, role: Role) -> subprocess.Popen[
 
 
 def _fill(station: ChaosStation) -> Undo:
-    filler = station.runs / "filler"
+    filler = station.disk / "filler"
     with open(filler, "wb") as file:
-        room = os.statvfs(station.runs)
+        room = os.statvfs(station.disk)
         with contextlib.suppress(OSError):
             os.posix_fallocate(file.fileno(), 0, (room.f_bavail - 16) * room.f_frsize)
         with contextlib.suppress(OSError):  # and the last blocks
@@ -156,11 +156,10 @@ def _limit_files(station: ChaosStation) -> Undo:
 
 def _read_only(station: ChaosStation) -> Undo:
     """A disk cannot become read-only while it is written: the recorder is killed first."""
-    where = f"/var/lib/private/palpate/{station.name}/runs"
 
     def remount(how: str) -> bool:
-        station.system.run("mount", "-o", f"remount,{how}", where)
-        return f"{where} ext4 {how}," in station.run("cat", "/proc/mounts")
+        station.system.run("mount", "-o", f"remount,{how}", FOLDER)
+        return f"{FOLDER} ext4 {how}," in station.run("cat", "/proc/mounts")
 
     deadline_s = time.monotonic() + 20.0
     while True:
@@ -177,7 +176,7 @@ def _cannot(what: str) -> None:
 
 
 def _hang_disk(station: ChaosStation) -> Undo:
-    where = str(station.runs)
+    where = str(station.disk)
     host("fsfreeze", "--freeze", where)
     return lambda: host("fsfreeze", "--unfreeze", where)
 
@@ -271,14 +270,14 @@ _SEPARATE = ("unit", "clock", "client")
 _PART = 2
 
 
-def schedule(seed: int) -> Iterator[tuple[Fault, Fault | None, float]]:
+def schedule(seed: int, only: str = "") -> Iterator[tuple[Fault, Fault | None, float]]:
     """Faults without end: one, the one that comes during it (None = none), the pause after [s].
 
     Each kind comes once before any comes twice. systemd gives up on a unit that starts five times
     in a minute, so those that start it again are kept apart.
     """
     rng = random.Random(seed)
-    faults = catalogue()
+    faults = tuple(one for one in catalogue() if only in one.name)
     while True:
         waiting = [*faults, *(one for one in faults if one.name in FREQUENT)]
         rng.shuffle(waiting)
@@ -295,10 +294,5 @@ def schedule(seed: int) -> Iterator[tuple[Fault, Fault | None, float]]:
                     for one in faults
                     if one.target not in (*_SEPARATE, fault.target) and one.lasts_s == 0.0
                 ]
-                second = rng.choice(others)
+                second = rng.choice(others) if others else None
             yield fault, second, rng.uniform(3.0, 6.0)
-
-
-def log_places() -> tuple[str, ...]:
-    """Shell patterns of the files that have the logs, in the system."""
-    return (str(Path("/var/lib/private/palpate/chaos/state/palpate/runs/*/logs/*.log*")),)

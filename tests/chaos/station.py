@@ -2,7 +2,7 @@
 
 It is in namespaces of its own. A cable (veth) leads from them to the robot's host, which is the
 namespace that this program runs in; the robot comes by mutual TLS, as from any other computer. The
-recordings lie on a disk of their own, an ext4 on a loop device, which whoever starts this makes.
+station has a disk of its own, an ext4 on a loop device, which whoever starts this makes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from palpate_deploy.station.certificates import issue, make_authority
 
 NAME = "chaos"
 UNIT, SOLVER = f"palpate@{NAME}", f"palpate-fem@{NAME}"
-STATE = f"/var/lib/palpate/{NAME}"
+FOLDER = f"/var/lib/private/palpate/{NAME}"
 PROFILE = f"/etc/palpate/{NAME}.toml"
 CERTIFICATES = "/etc/palpate/certs"
 LINE = "/dev/palpate-finger"
@@ -140,17 +140,11 @@ class ChaosStation:
         self.run(PALPATE, "install", f"/etc/{NAME}.toml", "--allow", NETWORK)
 
     def start(self) -> None:
-        """Start the unit; the first start makes the folder that the disk is then mounted in."""
-        folder = f"/var/lib/private/palpate/{NAME}"
-        self.run("systemctl", "start", UNIT)
-        until(lambda: bool(self.system.run("ls", folder).strip()), "the station has its folder")
-        self.run("systemctl", "stop", UNIT)
-        owner = self.system.run("stat", "-c", "%u:%g", folder).strip()
+        """Mount the station's own disk, and start the unit."""
         number = self._disk.removeprefix("/dev/loop")
-        self.run("sh", "-ec", f"rm -rf {folder}/runs; mkdir {folder}/runs; "
-                 f"mknod /dev/disk b 7 {number}; mount -t ext4 /dev/disk {folder}/runs; "
-                 f"rmdir {folder}/runs/lost+found; chown {owner} {folder}/runs {folder}; "
-                 f"chmod 700 {folder}/runs")  # fmt: skip
+        self.run("sh", "-ec", f"mkdir -p -m 700 /var/lib/private; mkdir -p {FOLDER}; "
+                 f"mknod /dev/disk b 7 {number}; mount -t ext4 /dev/disk {FOLDER}; "
+                 f"rmdir {FOLDER}/lost+found")  # fmt: skip
         self.run("systemctl", "start", UNIT)
 
     def run(self, *command: str) -> str:
@@ -160,7 +154,12 @@ class ChaosStation:
     @property
     def runs(self) -> Path:
         """The folder of the recordings, seen from outside."""
-        return Path(f"/proc/{self.first}/root/var/lib/private/palpate/{NAME}/runs")
+        return Path(f"/proc/{self.first}/root{FOLDER}/runs")
+
+    @property
+    def disk(self) -> Path:
+        """Where the station's disk is mounted, seen from outside."""
+        return Path(f"/proc/{self.first}/root{FOLDER}")
 
     def set_clock(self, offset_s: float) -> None:
         """Move the wall clock of the station's processes against the host's [s]."""
@@ -255,6 +254,24 @@ class ChaosStation:
         if not children:
             raise LookupError("worker")
         return max(children, key=lambda one: one.inner)
+
+    def save(self) -> list[str]:
+        """Stop the unit; copy journal, logs and recordings into ``work``; what it left in memory.
+
+        ``work/logs`` has ``journal.jsonl`` and the logs of all processes of all runs.
+        """
+        self.run("systemctl", "stop", UNIT)
+        logs = self.work / "logs"
+        logs.mkdir()
+        journal = self.run("journalctl", "--output=json", "--no-pager")
+        (logs / "journal.jsonl").write_text(journal, encoding="utf-8")
+        for file in sorted(self.disk.glob("state/palpate/runs/*/logs/*")):
+            shutil.copy(file, logs / f"{file.parent.parent.name}-{file.name}")
+        shutil.copytree(self.runs, self.work / "recordings")
+        for token in self.disk.glob("state/palpate/**/*token*"):
+            shutil.copy(token, self.work / "token")
+        found = self.run("find", "/dev/shm", "/tmp", "/var/tmp", "-mindepth", "1")
+        return [*found.splitlines(), *(one.command for one in self.find("/opt/palpate"))]
 
 
 def send(pid: int, number: int) -> None:
