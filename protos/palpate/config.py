@@ -198,7 +198,8 @@ class LinkConfig(StrictConfig):
         listen: Endpoints for direct links from peers; port 0 = any free one.
         direct: Whether processes link to one another directly (least latency). False = all data
             through the router: one path, so that nothing is overtaken while a direct link comes
-            up. A lossless replay needs that.
+            up. A lossless replay needs that. So it is, too, for who reaches the router at another
+            host and listens on loopback only.
         wait_for_router_s: How long opening waits for a router [s]; negative = no limit (services).
         lease_s: A peer silent for this long is gone [s].
         wall_clock_error_s: How far the wall clock of another host may be from this host's [s]. A
@@ -259,6 +260,18 @@ class LinkConfig(StrictConfig):
                     "role: use tls/HOST:PORT, or tls.roles = false"
                 )
         return self
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether direct links to other processes are possible, and wanted.
+
+        From another host than the router's they come about only if this process listens where
+        others reach it. A peer that cannot be reached, and reaches nobody, would get no stream at
+        all: the router passes messages on for clients only.
+        """
+        elsewhere = any(not is_loopback(endpoint_host_port(one)[0]) for one in self.connect)
+        reachable = any(not is_loopback(endpoint_host_port(one)[0]) for one in self.listen)
+        return self.direct and (reachable or not elsewhere)
 
     def as_role(self, role: Role) -> LinkConfig:
         """The link of a process with this role: with its certificates from ``certificates``.

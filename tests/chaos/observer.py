@@ -52,7 +52,7 @@ class Robot:
         self.stop = stop_on_signals()
         link = joining_link(endpoint, wait_s=_START_S, tls=certificates)
         self.client = Client(endpoint, tls=certificates, timeout_s=_START_S)
-        self.watcher = open_zenoh(link, "peer")
+        self.watcher = open_zenoh(link, "client")
         self.rows: dict[str, list[tuple[int, ...]]] = {"features": [], "electrodes": []}
         self.statuses: list[dict[str, Any]] = []
         self.tokens: list[tuple[int, str, str, bool]] = []

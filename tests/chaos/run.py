@@ -102,7 +102,6 @@ def main() -> int:
         status = _in_namespaces(given, disk)
     if status:
         return status
-    return 0
     from tests.chaos.report import report  # what it needs is not there inside
 
     result = report(given.work, given.minutes, given.seed)
@@ -142,7 +141,8 @@ def inside(work: Path, disk: str, minutes: float, seed: int, only: str) -> None:
         words = (ROUTER, str(station.certificates / "robot"), str(robot))
         observer = subprocess.Popen([sys.executable, "-m", "tests.chaos.observer", *words])
         try:
-            _await(robot, _START_S)
+            if not _await(robot, _START_S):
+                raise SystemExit(f"the station does not become well: {read_now(robot)}")
             _until(time.monotonic() + _WARM_S)
             run.began_ns = time.monotonic_ns()
             run.uses["start"] = uses(station)

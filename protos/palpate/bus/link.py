@@ -225,7 +225,7 @@ class Session(Closing):
         Raises:
             LinkError: No router within ``link.wait_for_router_s``, or a port is in use.
         """
-        raw = open_zenoh(link, "peer" if link.direct else "client")
+        raw = open_zenoh(link, "peer" if link.is_direct else "client")
         # Zenoh opens a peer at once and looks for the router in the background.
         if link.wait_for_router_s >= 0 and link.connect:
             deadline = time.monotonic() + link.wait_for_router_s
