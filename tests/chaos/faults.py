@@ -74,7 +74,9 @@ class Fault:
 
 def _signal(name: str, number: signal.Signals) -> Act:
     def act(station: ChaosStation) -> None:
-        send(station.process_of(name).pid, number)
+        pid = station.process_of(name).pid
+        send(pid, number)
+        station.broken.append(pid)
 
     return act
 

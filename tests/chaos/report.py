@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from tests.chaos.debian import commit
 from tests.chaos.faults import Fault, catalogue
-from tests.chaos.observer import FRESH_S, HUNG_S
+from tests.chaos.observer import FRESH_S, HUNG_S, QUERY_S
 from tests.chaos.recordings import check_recordings
 
 
@@ -204,7 +204,7 @@ def _back(kind: Fault, event: dict[str, Any], notes: Notes, gaps: Rows) -> float
     what, _, name = kind.back.partition(" ")
     if what == "stream":
         wide = gaps[(gaps[:, 1] - gaps[:, 0] > HOLE_S * 1e9) & (gaps[:, 1] > begun)]
-        wide = wide[(wide[:, 0] < end) & (wide[:, 1] > since)]
+        wide = wide[(wide[:, 0] < event["well_ns"]) & (wide[:, 1] > since)]
         return max(0.0, (int(wide[-1, 1]) - since) * 1e-9) if len(wide) else 0.0
     if what == "ready":
         told = [(at, there) for at, who, which, there in notes.robot["tokens"]
@@ -343,16 +343,18 @@ def _told_lost(counters: dict[str, int]) -> int:
 
 
 def _queries(notes: Notes) -> dict[str, Any]:
-    said = Counter(one[2] for one in notes.robot["queries"])
-    times = [one[1] for one in notes.robot["queries"] if one[2] == "answered"]
-    late = sum(one[1] > HUNG_S for one in notes.robot["queries"])
+    queries = [one for one in notes.robot["queries"] if one[0] > notes.run["began_ns"] * 1e-9]
+    said = Counter(one[2] for one in queries)
+    times = [one[1] for one in queries if one[2] == "answered"]
+    late = sum(one[1] > HUNG_S for one in queries)
     return {
-        "asked": len(notes.robot["queries"]) + notes.robot["unanswered"],
+        "asked": len(queries) + notes.robot["unanswered"],
         "said": dict(said.most_common()),
         "hung": late + notes.robot["unanswered"],
         "untyped": sum(count for what, count in said.items() if what.startswith("untyped")),
+        "past_deadline": sum(one[1] > QUERY_S + 1.0 for one in queries),
         "p50_s": float(np.median(times)) if times else None,
-        "longest_s": max((one[1] for one in notes.robot["queries"]), default=None),
+        "longest_s": max((one[1] for one in queries), default=None),
     }
 
 

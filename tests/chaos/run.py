@@ -146,6 +146,7 @@ def inside(work: Path, disk: str, minutes: float, seed: int, only: str) -> None:
             _until(time.monotonic() + _WARM_S)
             run.began_ns = time.monotonic_ns()
             run.uses["start"] = uses(station)
+            there = set(station.leavings())
             say("all is well; it begins")
             _break(station, robot, run, minutes, seed, only)
             _until(time.monotonic() + _WARM_S)
@@ -161,7 +162,7 @@ def inside(work: Path, disk: str, minutes: float, seed: int, only: str) -> None:
             observer.terminate()
             observer.wait(60.0)
         say("stopping, saving logs and recordings ...")
-        run.left = station.save()
+        run.left = sorted(set(station.save()) - there)
         (work / "run.json").write_text(json.dumps(asdict(run)), encoding="utf-8")
 
 
@@ -185,6 +186,7 @@ def _break(
             if undo is not None:
                 undo()
                 event.mended_ns = time.monotonic_ns()
+        _until_gone(station.broken)
         well_ns = _await(robot, PATIENCE_S)
         for event, _ in events:
             event.well_ns, event.pair = well_ns, second is not None
@@ -213,6 +215,15 @@ def _begin(station: ChaosStation, fault: Fault, robot: Path) -> tuple[Event, Und
         return Event(fault.name, begun_ns, begun_ns), undo
 
 
+def _until_gone(broken: list[int]) -> None:
+    """Wait until what was killed or stopped has been ended by whoever watches it."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while broken and time.monotonic() < deadline_s:
+        broken[:] = [pid for pid in broken if use_of(pid) is not None]
+        time.sleep(_LOOK_S)
+    broken.clear()
+
+
 def _until(due_s: float) -> None:
     time.sleep(max(0.0, due_s - time.monotonic()))
 
@@ -229,7 +240,7 @@ def _await(robot: Path, patience_s: float) -> int:
             and now["age_s"] < 5 * FRESH_S
             and _ALL <= set(now["ready"])
             and now["answered_s"] < 3.0
-            and not [one for one, state in now["states"].items() if state == "DEGRADED"]
+            and not [one for one, state in now["states"].items() if state == "DEGRADED" and one != "gateway"]
         )
         if not well:
             since_ns = 0

@@ -94,6 +94,8 @@ class ChaosStation:
     def __init__(self, root: Path, work: Path, disk: str, group: str) -> None:
         self.root, self.work, self._disk, self._group = root, work, disk, group
         self.certificates = work / "certs"
+        self.broken: list[int] = []
+        """Processes that were killed or stopped, and are to be replaced."""
         self._stack = contextlib.ExitStack()
         self._emulator: subprocess.Popen[bytes] | None = None
 
@@ -256,7 +258,7 @@ class ChaosStation:
         return max(children, key=lambda one: one.inner)
 
     def save(self) -> list[str]:
-        """Stop the unit; copy journal, logs and recordings into ``work``; what it left in memory.
+        """Stop the unit; copy journal, logs and recordings into ``work``; what it left behind.
 
         ``work/logs`` has ``journal.jsonl`` and the logs of all processes of all runs.
         """
@@ -270,8 +272,14 @@ class ChaosStation:
         shutil.copytree(self.runs, self.work / "recordings")
         for token in self.disk.glob("state/palpate/**/*token*"):
             shutil.copy(token, self.work / "token")
+        left = [one.command for one in self.find("/opt/palpate") if "emulate" not in one.command]
+        return [*self.leavings(), *left]
+
+    def leavings(self) -> list[str]:
+        """Files in memory and in temporary folders."""
         found = self.run("find", "/dev/shm", "/tmp", "/var/tmp", "-mindepth", "1")
-        return [*found.splitlines(), *(one.command for one in self.find("/opt/palpate"))]
+        # The unit's own, empty /tmp goes with it; its name changes.
+        return [line for line in found.splitlines() if "systemd-private" not in line]
 
 
 def send(pid: int, number: int) -> None:

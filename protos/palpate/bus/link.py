@@ -524,7 +524,7 @@ class Session(Closing):
         Raises:
             LinkError: There is no router.
         """
-        if not self._link.direct or not self._link.connect:
+        if not self._link.is_direct or not self._link.connect:
             return self
         with self._observing_lock:
             if self._observing is None:
