@@ -41,7 +41,7 @@ HUNG_S = QUERY_S + GRACE_S + 3.0
 
 _CONTROL_S = 0.01
 _NOW_S = 0.2
-_START_S = 180.0
+_START_S = 420.0
 
 
 class Robot:

@@ -24,6 +24,7 @@ from palpate_deploy.station.certificates import issue, make_authority
 
 NAME = "chaos"
 UNIT, SOLVER = f"palpate@{NAME}", f"palpate-fem@{NAME}"
+KERNELS = f"/var/cache/private/palpate/{NAME}"
 FOLDER = f"/var/lib/private/palpate/{NAME}"
 PROFILE = f"/etc/palpate/{NAME}.toml"
 CERTIFICATES = "/etc/palpate/certs"
@@ -112,6 +113,9 @@ class ChaosStation:
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
+        # Compiled once: on a busy host that takes minutes.
+        if (made := self.root / KERNELS[1:]).exists():
+            shutil.copytree(made, self.work / "kernels", dirs_exist_ok=True)
 
     def _connect(self) -> None:
         """A cable to the robot's host."""
@@ -134,6 +138,8 @@ class ChaosStation:
         shutil.rmtree(target, ignore_errors=True)
         for role in (Role.ROUTER, Role.GATEWAY, Role.SERVICE):
             shutil.copytree(self.certificates / role, target / role)
+        if (made := self.work / "kernels").exists():
+            shutil.copytree(made, self.root / KERNELS[1:], dirs_exist_ok=True)
         (self.root / f"etc/systemd/system/{UNIT}.service.d").mkdir(parents=True, exist_ok=True)
         drop_in = self.root / f"etc/systemd/system/{UNIT}.service.d/clock.conf"
         drop_in.write_text(_DROP_IN, encoding="utf-8")
