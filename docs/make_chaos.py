@@ -61,9 +61,8 @@ def _goals(found: dict[str, Any]) -> str:
 
 
 def _availability(found: dict[str, Any]) -> str:
-    share, estimates, asked = found["availability"], found["estimates"], found["availability"]
-    load, queries, records = found["load"], found["queries"], found["recordings"]
-    asked = share["asked"]
+    share, estimates, load = found["availability"], found["estimates"], found["load"]
+    asked, queries, records = share["asked"], found["queries"], found["recordings"]
     said = ", ".join(f"{count} {what}" for what, count in queries["said"].items())
     return (
         f"A fresh estimate (30 ms old at most, of which the finger and its line take 12) was there "
@@ -71,8 +70,8 @@ def _availability(found: dict[str, Any]) -> str:
         f"% of the {share['between_faults_s']:.0f} s outside of faults. A controller that asked "
         f"{asked['asked']:,} times got one {asked['fresh']:,} times, and was told "
         f"{asked['too_old']:,} times that there is none. The machine was not idle: "
-        f"{found['machine']['cpus']} cores, load {load['median']:.1f} in the median, {load['least']:.1f} "
-        f"to {load['most']:.1f}.\n\n"
+        f"{found['machine']['cpus']} cores, load {load['median']:.1f} in the median, "
+        f"{load['least']:.1f} to {load['most']:.1f}.\n\n"
         f"{estimates['received']:,} estimates came, {1e3 * estimates['p50_s']:.1f} ms old in the "
         f"median, {1e3 * estimates['p99_s']:.1f} ms for 99 %.\n\n"
         f"Simulations: {queries['asked']} asked, {said}; {_s(queries['p50_s'])} in the median, "

@@ -17,7 +17,6 @@ from tests.chaos.faults import Fault, catalogue
 from tests.chaos.observer import FRESH_S, HUNG_S, QUERY_S
 from tests.chaos.recordings import check_recordings
 
-
 from palpate_deploy.bench.results import machine
 
 Rows = npt.NDArray[np.int64]
@@ -84,15 +83,13 @@ def holes(rows: Rows, began_ns: int, ended_ns: int) -> Rows:
     order = np.argsort(rows[:, _ARRIVAL], kind="stable")
     arrived = rows[order, _ARRIVAL]
     until = np.maximum.accumulate(rows[order, _STAMP]) + round(FRESH_S * 1e9)
-    # Fresh from each arrival until the estimate is too old, or the next one takes over.
-    ends = np.concatenate([[began_ns], np.maximum.accumulate(until)])
-    starts = np.concatenate([arrived, [ended_ns]])
-    found = [
-        (max(int(end), began_ns), min(int(start), ended_ns))
-        for end, start in zip(ends, starts, strict=True)
-        if start > end
-    ]
-    return np.array([one for one in found if one[1] > one[0]], np.int64).reshape(-1, 2)
+    # Fresh from each arrival until the estimate is too old; one that is too old when it comes
+    # changes nothing.
+    fresh = until > arrived
+    ends = np.maximum.accumulate(np.concatenate([[began_ns], until[fresh]]))
+    starts = np.concatenate([arrived[fresh], [ended_ns]])
+    found = np.stack([np.maximum(ends, began_ns), np.minimum(starts, ended_ns)], axis=1)
+    return found[found[:, 1] > found[:, 0]].astype(np.int64)
 
 
 def share_without(gaps: Rows, began_ns: int, ended_ns: int) -> float:
@@ -450,5 +447,3 @@ def goals(found: dict[str, Any]) -> list[dict[str, Any]]:
          ", ".join(found["left"]) or "nothing", not found["left"]),
     ]  # fmt: skip
     return [{"what": what, "found": said, "met": bool(met)} for what, said, met in table]
-
-

@@ -241,8 +241,11 @@ def _await(robot: Path, patience_s: float) -> int:
             and _ALL <= set(now["ready"])
             and now["answered_s"] < 3.0
             # Gateway and estimating services come and go where this host is busy: the age counts.
-            and not [one for one in ("recorder", "supervisor", "fem")
-                     if now["states"].get(one) == "DEGRADED"]
+            and not [
+                one
+                for one in ("recorder", "supervisor", "fem")
+                if now["states"].get(one) == "DEGRADED"
+            ]
         )
         if not well:
             since_ns = 0

@@ -68,7 +68,17 @@ _DROP_IN = f"""\
 Environment=LD_PRELOAD={CLOCK_IN_IMAGE} CHAOS_CLOCK={_CLOCK}
 """
 
-EMULATOR = [PALPATE, "emulate", "biotac-bridge", "--link", LINE, "--fingers", "1", "--play", "press"]
+EMULATOR = [
+    PALPATE,
+    "emulate",
+    "biotac-bridge",
+    "--link",
+    LINE,
+    "--fingers",
+    "1",
+    "--play",
+    "press",
+]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,9 @@
-"""Others on the bus that do no good: python -m tests.chaos.strangers WHAT ROUTER CERTIFICATES SENSOR
+"""Others on the bus that do no good.
 
-``flood`` asks for 400 simulations at once, ``malformed`` sends 5000 frames that are none, ``listen``
-takes every estimate until it is stopped. Each says on stdout what came of it, as JSON.
+python -m tests.chaos.strangers WHAT ROUTER CERTIFICATES SENSOR
+
+``flood`` asks for 400 simulations at once, ``malformed`` sends 5000 frames that are none,
+``listen`` takes every estimate until it is stopped. Each says what came of it, as JSON.
 """
 
 from __future__ import annotations
@@ -73,9 +75,7 @@ def malformed(session: zenoh.Session, sensor: str) -> dict[str, int]:
     wrong = zenoh.Encoding(ENCODING_PREFIX + "palpate.v9.Frame")
     due_s = time.monotonic()
     for number in range(FRAMES):
-        session.put(
-            key, rng.randbytes(rng.randrange(400)), encoding=right if number % 4 else wrong
-        )
+        session.put(key, rng.randbytes(rng.randrange(400)), encoding=right if number % 4 else wrong)
         due_s += 1.0 / FRAMES_HZ
         time.sleep(max(0.0, due_s - time.monotonic()))
     return {"sent": FRAMES}
@@ -86,7 +86,8 @@ def listen(endpoint: str, certificates: Path, sensor: str) -> None:
     with Client(endpoint, tls=certificates, timeout_s=30.0) as client:
         stream = client.session.subscriber(FEATURES, sensor=sensor, delivery=Delivery.QUEUE)
         stream.next(30.0)
-        print("listens", flush=True)
+        sys.stdout.write("listens\n")
+        sys.stdout.flush()
         while True:
             try:
                 stream.next(1.0)
@@ -105,7 +106,7 @@ def main(what: str, endpoint: str, certificates: Path, sensor: str) -> None:
         found = {"flood": flood, "malformed": malformed}[what](session, sensor)
     finally:
         session.close()
-    print(json.dumps({"what": what, **found}))
+    sys.stdout.write(json.dumps({"what": what, **found}) + "\n")
 
 
 if __name__ == "__main__":

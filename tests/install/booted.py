@@ -71,7 +71,7 @@ def become_systemd(root: Path) -> None:
 
 
 class Booted:
-    """A system whose systemd runs; use it in a ``with`` block. ``group`` names its control group."""
+    """A system whose systemd runs, in a control group; use it in a ``with`` block."""
 
     def __init__(self, root: Path, group: str = "") -> None:
         self._group = groups() / (group or f"palpate-proof-{os.getpid()}")
