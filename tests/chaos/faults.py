@@ -12,7 +12,6 @@ import resource
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -157,24 +156,14 @@ def _limit_files(station: ChaosStation) -> Undo:
 
 
 def _read_only(station: ChaosStation) -> Undo:
-    """A disk cannot become read-only while it is written: the recorder is killed first."""
-
-    def remount(how: str) -> bool:
-        station.system.run("mount", "-o", f"remount,{how}", FOLDER)
-        return f"{FOLDER} ext4 {how}," in station.run("cat", "/proc/mounts")
-
-    deadline_s = time.monotonic() + 20.0
-    while True:
-        with contextlib.suppress(LookupError):
-            send(station.process_of("recorder").pid, signal.SIGKILL)
-        if remount("ro"):
-            return lambda: None if remount("rw") else _cannot("remount")
-        if time.monotonic() > deadline_s:
-            _cannot("remount")
-
-
-def _cannot(what: str) -> None:
-    raise SystemExit(f"the chaos run itself failed: {what}")
+    """What the recorder has open stays open, so it is killed; the next one finds the folder so."""
+    main = station.process_of("up").pid
+    inside = ("nsenter", f"--target={main}", "--mount")
+    runs = f"{FOLDER}/runs"
+    host(*inside, "mount", "--bind", runs, runs)
+    host(*inside, "mount", "-o", "remount,bind,ro", runs)
+    send(station.process_of("recorder").pid, signal.SIGKILL)
+    return lambda: host(*inside, "umount", "--lazy", runs)
 
 
 def _hang_disk(station: ChaosStation) -> Undo:
@@ -195,7 +184,12 @@ def _silence(station: ChaosStation) -> Undo:
     emulators = station.find("emulate biotac-bridge")
     for process in emulators:
         send(process.pid, signal.SIGSTOP)
-    return lambda: [send(process.pid, signal.SIGCONT) for process in emulators] and None
+
+    def end() -> None:
+        for process in emulators:
+            send(process.pid, signal.SIGCONT)
+
+    return end
 
 
 def _unplug(station: ChaosStation) -> Undo:
@@ -246,7 +240,7 @@ def catalogue() -> tuple[Fault, ...]:
         Fault("disk refuses to write", "disk", _limit_files, 6.0, "state recorder", 3.0,
               "state recorder", 1.0, r"File too large|refuse", own=True),
         Fault("disk read-only when the recorder starts", "disk", _read_only, 6.0,
-              "state recorder", 3.0, "token recorder", 0.1, r"Read-only", own=True),
+              "state recorder", 3.0, "state recorder", 3.0, r"Read-only", own=True),
         Fault("disk hangs for 3 s", "disk", _hang_disk, 3.0, "state recorder", 3.0, own=True),
         Fault("wall clock +1 h, and back", "clock", _jump(3600.0), 8.0, "stream", 0.2, "steps",
               2.0, r"wall clock was set by"),

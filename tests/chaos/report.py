@@ -149,6 +149,7 @@ def report(work: Path, minutes: float, seed: int) -> dict[str, Any]:
         "recordings": check_recordings(work / "recordings", notes.frames, events),
         "uses": run["uses"],
         "zombies": run["zombies"],
+        "undone": run["undone"],
         "left": run["left"],
         "secrets": _secrets(work),
     }

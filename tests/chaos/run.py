@@ -75,6 +75,7 @@ class Run:
     zombies: dict[str, int] = field(default_factory=dict)
     left: list[str] = field(default_factory=list)
     load: list[float] = field(default_factory=list)
+    undone: list[str] = field(default_factory=list)
 
 
 def main() -> int:
@@ -175,16 +176,27 @@ def _break(
         if time.monotonic() > end_s:
             return
         run.load.append(os.getloadavg()[0])
-        events = [_begin(station, fault, robot)]
-        if second is not None:
-            _until(time.monotonic() + 0.5)
-            events.append(_begin(station, second, robot))
+        events = []
+        try:
+            events.append(_begin(station, fault))
+            if second is not None:
+                _until(time.monotonic() + 0.5)
+                events.append(_begin(station, second))
+        except OSError as error:  # this host cannot
+            run.undone.append(f"{fault.name}: {error}")
+            say(f"not done: {error}")
+            if not events:
+                continue
+            second = None
         for event, undo in reversed(events):
             chosen = fault if event.fault == fault.name else second
             assert chosen is not None
             _until(event.begun_ns * 1e-9 + chosen.lasts_s)
             if undo is not None:
-                undo()
+                try:
+                    undo()
+                except OSError as error:
+                    run.undone.append(f"{event.fault}: {error}")
                 event.mended_ns = time.monotonic_ns()
         _until_gone(station.broken)
         well_ns = _await(robot, PATIENCE_S)
@@ -198,7 +210,7 @@ def _break(
         _until(time.monotonic() + pause_s)
 
 
-def _begin(station: ChaosStation, fault: Fault, robot: Path) -> tuple[Event, Undo | None]:
+def _begin(station: ChaosStation, fault: Fault) -> tuple[Event, Undo | None]:
     """Do it. What is being started again anyway is waited for."""
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
@@ -208,7 +220,7 @@ def _begin(station: ChaosStation, fault: Fault, robot: Path) -> tuple[Event, Und
             undo = fault.act(station)
         except LookupError:
             if time.monotonic() > deadline_s:
-                raise SystemExit(f"{fault.name}: nothing to break there") from None
+                raise OSError(f"{fault.name}: nothing to break there") from None
             time.sleep(_LOOK_S)
             continue
         begun_ns = before_ns if undo is None else time.monotonic_ns()

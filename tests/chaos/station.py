@@ -308,8 +308,8 @@ def host(*command: str) -> None:
     """Run a command in the namespaces of this program.
 
     Raises:
-        SystemExit: It fails.
+        OSError: It fails.
     """
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f"{' '.join(command)}: {done.stderr.strip()}")
+        raise OSError(f"{' '.join(command)}: {done.stderr.strip()}")
