@@ -33,7 +33,7 @@ from tests.install.debian import ROOT
 from palpate_deploy.bench.growth import Use, use_of
 
 OUT = ROOT / "docs" / "results" / "chaos.json"
-WORK = Path("/var/tmp/palpate-chaos")
+WORK = Path("/var/cache/palpate-chaos")
 
 PATIENCE_S = 90.0
 """So long a station may take until all is well again, before the next fault comes anyway."""
