@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel release clean sbom audit debian
+.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel release clean sbom audit debian chaos
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -85,6 +85,11 @@ fuzz: $(VENV)/.dev  ## fuzz the gateway's decoders: make fuzz DECODER=kms40 SECO
 debian: $(VENV)/.dev  ## install on a bare Debian, run a robot, uninstall: what is left? | 10 min, as root, Linux only
 	$(BIN)/python -m tests.install.debian
 	$(BIN)/python docs/make_install.py
+
+chaos: $(VENV)/.dev  ## an installed station while one thing after another breaks: MINUTES=30 SEED=1 | 35 min, as root, Linux only
+	@failed=0; \
+	$(BIN)/python -m tests.chaos.run --minutes $(or $(MINUTES),30) --seed $(or $(SEED),1) || failed=1; \
+	$(BIN)/python docs/make_chaos.py; exit $$failed
 
 mutants: $(VENV)/.dev  ## plant small faults in the central modules: which do the tests notice? | 1 h, Linux only
 	@$(pip_install) -e '.[mutants]' | $(show)

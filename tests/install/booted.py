@@ -63,15 +63,18 @@ def become_systemd(root: Path) -> None:
     os.chdir(root)
     subprocess.run(["pivot_root", ".", "run/host"], check=True)
     subprocess.run(["umount", "-l", "/run/host"], check=True)
+    # As every container manager does: what is mounted for a service, its credentials, must reach
+    # the namespace of that service.
+    image.mount("--make-rshared", "/")
     words = ["setpriv", f"--bounding-set={TAKEN}", "env", "-i", "container=other"]
     os.execvp("setpriv", [*words, f"PATH={image.PLAIN['PATH']}", "/lib/systemd/systemd"])
 
 
 class Booted:
-    """A system whose systemd runs; use it in a ``with`` block."""
+    """A system whose systemd runs, in a control group; use it in a ``with`` block."""
 
-    def __init__(self, root: Path) -> None:
-        self._group = groups() / f"palpate-proof-{os.getpid()}"
+    def __init__(self, root: Path, group: str = "") -> None:
+        self._group = groups() / (group or f"palpate-proof-{os.getpid()}")
         self._group.mkdir()
         inner = [sys.executable, "-m", "tests.install.booted", str(root)]
         namespaces = ["--mount", "--net", "--pid", "--ipc", "--uts", "--cgroup", "--fork"]
@@ -104,13 +107,12 @@ class Booted:
     def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.wait()
-        for _attempt in range(100):
-            for folder, _folders, _files in os.walk(self._group, topdown=False):
-                with contextlib.suppress(OSError):
-                    os.rmdir(folder)
-            if not self._group.exists():
-                return
-            time.sleep(0.1)
+        remove_group(self._group)
+
+    @property
+    def first(self) -> int:
+        """Process id of its systemd, as the host counts."""
+        return self._first
 
     def run(self, *command: str, status: int | None = None) -> str:
         """Output of a command in the system; with ``status`` it must end so."""
@@ -151,6 +153,17 @@ class Booted:
         """Process id of a supervised process; empty = none."""
         asked = f"palpate_deploy run {service} "
         return next((pid for pid, line in self.commands().items() if asked in line), "")
+
+
+def remove_group(group: Path) -> None:
+    """Remove a control group with all below it, as soon as its processes have ended."""
+    for _attempt in range(100):
+        for folder, _folders, _files in os.walk(group, topdown=False):
+            with contextlib.suppress(OSError):
+                os.rmdir(folder)
+        if not group.exists():
+            return
+        time.sleep(0.1)
 
 
 def until(done: Callable[[], bool], what: str) -> float:

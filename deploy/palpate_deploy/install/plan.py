@@ -121,7 +121,7 @@ def _check_folders(profile: profiles.Profile, state: PurePosixPath) -> None:
         if not Path(os.path.normpath(Path(state) / folder)).is_relative_to(state):
             raise ConfigError(
                 f"{key}, {str(folder)!r}: a service writes into {state} only",
-                remedy=f"write {instead!r}; a disk of its own can be mounted there",
+                remedy=f"write {instead!r}; for a disk of its own see docs/install.md",
             )
 
 
