@@ -19,10 +19,11 @@ PAGE = FILE.with_suffix(".md")
 
 HEAD = """# Five readers
 
-Each follows the page that [the index](../README.md) names, by a program: `make readers` pastes the commands
-of the page, in order, into terminals in a fresh folder with a fresh home, installs the wheel of `make build` as
-the page says, answers what is asked as the page says, and looks at what came of it. Hardware is played by the
-emulators that the page starts. What no program stands in for: understanding the page, and a view in a window.
+Each follows the page that [the index](../README.md) names, by a program: `make readers` pastes the
+commands of the page, in order, into terminals in a fresh folder with a fresh home, installs the wheel
+of `make build` as the page says, answers what is asked as the page says, and looks at what came of it.
+Hardware is played by the emulators that the page starts. What no program stands in for: understanding
+the page, and a view in a window.
 """
 
 
@@ -58,10 +59,12 @@ def _steps(one: dict[str, Any]) -> Iterator[str]:
 def page(values: dict[str, Any]) -> str:
     """The page of a result."""
     readers = values["readers"]
+    least, most = min(values["load"]), max(values["load"])
     where = (
-        f"Python {values['python']}, {values['cores']} cores, {values['machine']}; before a reader "
-        f"began, {min(values['load']):.0f} to {max(values['load']):.0f} programs of others "
-        "wanted these cores (load average). The installation downloads nothing that pip's cache has.\n"
+        f"Python {values['python']}, {values['cores']} cores, {values['machine']}. Load average "
+        f"before a reader began: {least:.1f} to {most:.1f}; above {values['cores']} the cores are "
+        "shared with other work, and everything takes longer. An installation downloads nothing "
+        "that pip's cache has.\n"
     )
     parts = "".join("".join(_steps(one)) for one in readers if "skipped" not in one)
     return f"{HEAD}\n{''.join(_summary(readers))}\n{where}{parts}"

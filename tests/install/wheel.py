@@ -32,8 +32,12 @@ DEMO = ("demo", "--seconds", "3", "--out", "demo")
 PRESS = ("fem", "run", "--edge-mm", "1.2", "--depth-mm", "0.5", "--steps", "2")
 
 
+class Failed(RuntimeError):
+    """A command did not end with 0."""
+
+
 def interpreter(name: str) -> Path | None:
-    """The Python of a name, a path or a version, on the search path or of pyenv; None = not here."""
+    """The Python of a name, path or version, on the search path or of pyenv; None = not here."""
     minor = name.removeprefix("python")
     found = [shutil.which(name), shutil.which(f"python{minor}")]
     versions = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
@@ -48,7 +52,11 @@ def interpreter(name: str) -> Path | None:
 
 
 def run(*command: str | Path, folder: Path) -> str:
-    """Output of a command; SystemExit with it if the command fails."""
+    """Output of a command.
+
+    Raises:
+        Failed: It does not end with 0.
+    """
     clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     done = subprocess.run(
         [str(word) for word in command],
@@ -61,9 +69,7 @@ def run(*command: str | Path, folder: Path) -> str:
         timeout=LIMIT_S,
     )
     if done.returncode:
-        raise SystemExit(
-            f"{' '.join(map(str, command))} ended with {done.returncode}\n{done.stdout}"
-        )
+        raise Failed(f"{' '.join(map(str, command))} ended with {done.returncode}\n{done.stdout}")
     return done.stdout
 
 
@@ -89,7 +95,8 @@ def tried(python: Path, wheel: Path, archive: Path) -> dict[str, Any]:
         run(python, "-m", "venv", "env", folder=home)
         pip = (home / "env" / "bin" / "pip", "install", "--quiet", "--disable-pip-version-check")
         run(*pip, f"{wheel}[{EXTRAS}]", folder=home)
-        version = run(home / "env/bin/python", "-c", "import platform; print(platform.python_version())", folder=home).strip()  # fmt: skip
+        asked = "import platform; print(platform.python_version())"
+        version = run(home / "env" / "bin" / "python", "-c", asked, folder=home).strip()
         of_wheel = files_of(home)
         palpate = home / "env" / "bin" / "palpate"
         run(palpate, "doctor", folder=home)
@@ -119,22 +126,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     (wheel,) = given.dist.resolve().glob("palpate-*.whl")
     (archive,) = given.dist.resolve().glob("palpate-*.tar.gz")
     results: list[dict[str, Any]] = []
-    absent = []
+    absent, failed = [], []
     for name in given.names:
         python = interpreter(name)
         if python is None:
             absent.append(name.removeprefix("python"))
             sys.stdout.write(f"{name}: not on this host, NOT tried\n")
             continue
-        results.append(tried(python, wheel, archive))
+        try:
+            results.append(tried(python, wheel, archive))
+        except Failed as error:
+            failed.append(f"{name}: {error}")
+            sys.stdout.write(f"{failed[-1]}\n")
+            continue
         sys.stdout.write(f"{name}: {json.dumps(results[-1])}\n")
         sys.stdout.flush()
     same = all(one["archive_gives_the_same_files"] for one in results)
     names = ", ".join(one["python"] for one in results) or "none"
     sys.stdout.write(f"tried: {names}; not tried: {', '.join(absent) or 'none'}\n")
-    report = {"extras": EXTRAS, "tried": results, "not_tried": absent}
+    report = {"extras": EXTRAS, "tried": results, "failed": failed, "not_tried": absent}
     given.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    return 0 if results and same else 1
+    return 0 if results and same and not failed else 1
 
 
 if __name__ == "__main__":

@@ -65,6 +65,7 @@ class Reader:
         promise: What the page promises.
         check: What came of it.
         own: Puts the reader's own files into the folder; the reason if there are none.
+        after: The reader whose environment is used instead of a new one.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Reader:
     promise: str
     check: Callable[[Visit], str]
     own: Callable[[Path], str] | None = None
+    after: str = ""
 
 
 def _laptop(visit: Visit) -> str:
@@ -102,8 +104,8 @@ def _lab(visit: Visit) -> str:
     if found["frames"] < 100 or not found["median_n"] < said_n:
         raise Unexpected(f"the bundle says {said_n} N; beside the truth: {found}")
     return (
-        f"the bundle of this finger says {said_n} N of presses held out; {found['frames']} frames on "
-        f"the bus are {found['median_n']:.2f} N (median) from the emulated truth"
+        f"the bundle of this finger says {said_n} N of presses held out; {found['frames']} frames "
+        f"on the bus are {found['median_n']:.2f} N (median) from the emulated truth"
     )
 
 
@@ -153,8 +155,8 @@ def _mechanics(visit: Visit) -> str:
     if not 0.5 < strongest < 10.0 or not 0.5 < moved < 3.0:
         raise Unexpected(f"{strongest} N, {moved} mm")
     return (
-        f"{strongest} N at 2 mm, picture of {sizes[0]}; a slide: {nodes:g} nodes read, the most moved "
-        f"by {moved} mm"
+        f"{strongest} N at 2 mm, picture of {sizes[0]}; a slide: {nodes:g} nodes read, "
+        f"the most moved by {moved} mm"
     )
 
 
@@ -209,6 +211,7 @@ READERS = (
         "a network of one's own with its error",
         _files,
         real_table,
+        "files",
     ),
     Reader(
         "robot",

@@ -58,15 +58,22 @@ def environment(home: Path) -> dict[str, str]:
     }
 
 
+def installs(block: Block) -> bool:
+    """Whether a block makes an environment."""
+    return block.marks.get("make readers", "").startswith(("installs", "makes an environment"))
+
+
 class Desk:
     """The terminals of a reader, and what was done in them."""
 
-    def __init__(self, folder: Path, home: Path, network: Network, stack: ExitStack) -> None:
+    def __init__(
+        self, folder: Path, home: Path, network: Network, stack: ExitStack, source: str
+    ) -> None:
         self.folder, self._variables = folder, environment(home)
         self._network, self._stack = network, stack
         self._front: Terminal | None = None
         self._running: list[tuple[str, Terminal]] = []
-        self._source = ""
+        self._source = source
         self._all: list[Terminal] = []
         self.steps: list[dict[str, Any]] = []
         self.visit = Visit(folder, prefix=network.prefix)
@@ -77,7 +84,7 @@ class Desk:
         Raises:
             Unexpected: A command fails, or does not do what the block's marks say.
         """
-        install = block.marks.get("make readers", "").startswith(("installs", "makes an env"))
+        install = installs(block)
         if install:
             terminal = self._open(())
         elif "background until" in block.marks or self._front is None:
@@ -163,10 +170,13 @@ def follow(reader: Reader, dist: Path, work: Path) -> dict[str, Any]:
     if lacks:
         return {**found, "skipped": lacks}
     with ExitStack() as stack:
-        desk = Desk(folder, home, stack.enter_context(Network()), stack)
+        source = (
+            f"source {work.parent / reader.after}/work/env/bin/activate" if reader.after else ""
+        )
+        desk = Desk(folder, home, stack.enter_context(Network()), stack, source)
         try:
             for page in reader.pages:
-                left_out = _page(ROOT / "docs" / page, desk, folder)
+                left_out = _page(ROOT / "docs" / page, desk, folder, again=bool(reader.after))
                 found.setdefault("left_out", []).extend(left_out)
                 if page == reader.pages[-1]:
                     found["found"] = reader.check(desk.visit)
@@ -182,8 +192,10 @@ def follow(reader: Reader, dist: Path, work: Path) -> dict[str, Any]:
     return {**found, "steps": desk.steps}
 
 
-def _page(path: Path, desk: Desk, folder: Path) -> list[str]:
+def _page(path: Path, desk: Desk, folder: Path, *, again: bool) -> list[str]:
     """Do what a page says; which commands were left out, and why.
+
+    ``again``: the environment is there.
 
     Raises:
         Unexpected: Something is not as the page says.
@@ -197,6 +209,8 @@ def _page(path: Path, desk: Desk, folder: Path) -> list[str]:
         if "file" in marks:
             (desk.folder / marks["file"]).write_text(block.text, encoding="utf-8")
         elif marks.get("stand-in for") and (folder / marks["stand-in for"]).exists():
+            printed = ""
+        elif again and installs(block):
             printed = ""
         elif "not run" in marks:
             left_out.extend(f"`{line}`: {marks['not run']}" for line in block.lines)

@@ -1,4 +1,4 @@
-"""A terminal as a reader has it: an interactive bash behind a pseudo-terminal, and what it shows."""
+"""A terminal as a reader has it: an interactive bash behind a pseudo-terminal, and its screen."""
 
 from __future__ import annotations
 
@@ -211,9 +211,8 @@ class Terminal:
         if len(self.shown) != length or _DONE.search(self.shown, self._read):
             return
         if not left:
-            raise Unexpected(
-                f"it asks, and the page does not say what to answer\n{plain(self.shown[self._read :])}"
-            )
+            said = plain(self.shown[self._read :])
+            raise Unexpected(f"it asks, and the page does not say what to answer\n{said}")
         answer = left.pop(0)
         os.write(self._master, answer.encode() + b"\n")
         while len(self.shown) == length:
