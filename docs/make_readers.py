@@ -20,10 +20,10 @@ PAGE = FILE.with_suffix(".md")
 HEAD = """# Five readers
 
 Each follows the page that [the index](../README.md) names, by a program: `make readers` pastes the
-commands of the page, in order, into terminals in a fresh folder with a fresh home, installs the wheel
-of `make build` as the page says, answers what is asked as the page says, and looks at what came of it.
-Hardware is played by the emulators that the page starts. What no program stands in for: understanding
-the page, and a view in a window.
+commands of the page, in order, into terminals in a fresh folder with a fresh home, installs the
+wheel of `make build` as the page says, answers what is asked as the page says, and looks at what
+came of it. Hardware is played by the emulators that the page starts. What no program stands in for:
+understanding the page, and a view in a window.
 """
 
 
