@@ -307,7 +307,7 @@ def _readers() -> Iterator[Claim]:
         "mechanics": "(guides/press-the-fingertip.md) | {minutes} + {install} |",
     }
     for one in _read("readers.json")["readers"]:
-        if one["reader"] not in index:
+        if one["reader"] not in index or "found" not in one:
             continue
         figures = {
             "minutes": str(math.ceil(one["minutes"])),

@@ -92,7 +92,7 @@ def _laptop(visit: Visit) -> str:
 
 
 def _lab(visit: Visit) -> str:
-    said_n = visit.number("palpate new-station", r"force_magnitude_median_n\W+#")
+    said_n = visit.number("palpate new-station", r"this bundle\s+│\s+#")
     report = visit.folder / "truth.json"
     program = [sys.executable, "-m", "tests.readers.truth", "try", str(report)]
     done = subprocess.run(
@@ -194,7 +194,7 @@ READERS = (
         "lab",
         "a BioTac on CAN and an ATI Net F/T on the table",
         ("first-biotac.md",),
-        "a station, a bundle for this finger, its forces on the bus with their error",
+        "a station, a bundle for this finger with its error, its forces on the bus",
         _lab,
     ),
     Reader(

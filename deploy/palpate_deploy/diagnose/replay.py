@@ -156,7 +156,7 @@ def print_account(account: ReplayAccount) -> None:
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _BAG_MAGIC = b"#ROSBAG"
 _POLL_S = 0.1
-_JOIN_S = 15.0
+_JOIN_S = 60.0
 _SETTLED_S = 20.0
 _LINGER_S = 1.0
 _ENDED = (ServiceState.FINISHED, ServiceState.DEGRADED)
