@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import contextlib
 import fcntl
 import os
 import pty
@@ -28,6 +29,7 @@ _UP = re.compile(r"\x1b\[(\d*)A")
 _ASKS = re.compile(r"(?:: |\]: ?|\? )$")
 """How a line ends that waits for an answer."""
 _LOOK_S = 0.05
+_PATIENCE_S = 60.0
 _QUIET_S = 1.0
 """So long nothing more comes when a program waits for an answer."""
 
@@ -92,14 +94,15 @@ class Terminal:
         command = [*prefix, "bash", "--noprofile", "--norc", "--noediting", "-i"]
         self.shown = ""
         self._read = 0
+        self._closed = False
         variables = {
             **environment,
             "PS1": "$ ",
             "TERM": "xterm-256color",
             "PROMPT_COMMAND": r'printf "\036%d\036" "$?"',
         }
-        self._pid, self._master = pty.fork()
-        if self._pid == 0:
+        self.pid, self._master = pty.fork()
+        if self.pid == 0:
             os.chdir(folder)
             os.execvpe(command[0], command, variables)
         fcntl.ioctl(self._master, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
@@ -132,7 +135,7 @@ class Terminal:
     @property
     def folder(self) -> Path:
         """Where it is now."""
-        return Path(os.readlink(f"/proc/{self._pid}/cwd"))
+        return Path(os.readlink(f"/proc/{self.pid}/cwd"))
 
     def run(self, line: str, *, answers: Sequence[str] = (), timeout_s: float) -> tuple[int, str]:
         """Exit code and output of a command.
@@ -168,19 +171,20 @@ class Terminal:
         return self._until_prompt(timeout_s)
 
     def close(self) -> None:
-        """Hang up; what still runs in it gets SIGHUP, as when a window is closed."""
-        try:
-            os.kill(self._pid, signal.SIGHUP)
-        except ProcessLookupError:
+        """Ctrl-C for what runs in it, and close the window; a second call does nothing."""
+        if self._closed:
             return
-        for _ in range(200):
-            if os.waitpid(self._pid, os.WNOHANG)[0]:
-                break
-            time.sleep(0.05)
-        else:
-            os.kill(self._pid, signal.SIGKILL)
-            os.waitpid(self._pid, 0)
-        os.close(self._master)
+        self._closed = True
+        with contextlib.suppress(Unexpected, OSError):
+            self.interrupt(_PATIENCE_S)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGHUP)
+        until = time.monotonic() + _PATIENCE_S
+        while not os.waitpid(self.pid, os.WNOHANG)[0]:
+            if time.monotonic() > until:
+                os.kill(self.pid, signal.SIGKILL)
+            time.sleep(_LOOK_S)
+        os.close(self._master)  # what is still there is hung up by the kernel
 
     def _send(self, line: str) -> None:
         self._read = len(self.shown)

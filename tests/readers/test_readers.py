@@ -108,3 +108,12 @@ def test_a_program_that_ends_instead_is_an_error(terminal: Terminal) -> None:
 )
 def test_what_is_drawn_over_is_not_seen(shown: str, seen: str) -> None:
     assert plain(shown) == seen
+
+
+def test_nothing_is_left_of_a_window_that_is_closed(tmp_path: Path) -> None:
+    left = tmp_path / "left"
+    with Terminal(tmp_path, {"PATH": os.environ["PATH"], "HOME": str(tmp_path)}) as one:
+        one.start(f"echo is  up; sleep 300; touch {left}", "is up", timeout_s=PATIENCE_S)
+        (child,) = Path(f"/proc/{one.pid}/task/{one.pid}/children").read_text().split()
+    assert not Path(f"/proc/{child}").exists()
+    assert not left.exists()
