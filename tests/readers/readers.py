@@ -84,7 +84,7 @@ def _laptop(visit: Visit) -> str:
     lines = [line for line in visit.said("python docs/examples").splitlines() if " N " in line]
     if len(lines) != 5 or not touched or not force < 1.0:
         raise Unexpected(f"{len(lines)} estimates; demo: {touched:g} touched, {force} N")
-    replayed = visit.number("palpate replay", r"finger/features\s+│\s+#")
+    replayed = visit.number("palpate replay", r"recorded features\s+│\s+([\d,]+)")
     return (
         f"{touched:g} touched frames in 5 s, median error {force} N and {place} mm; 5 estimates in "
         f"the second terminal; {replayed:g} replayed"
