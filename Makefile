@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel release clean sbom audit debian chaos
+.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel readers release clean sbom audit debian chaos
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -142,14 +142,13 @@ build: $(VENV)/.dev  ## wheel and source archive, into dist/; the same bytes fro
 	rm -rf dist
 	@$(BIN)/python -m hatchling build -d dist
 
-wheel: build  ## try the wheel in fresh environments: make wheel ON="python3.11 python3.13" | 2 min each
-	@for python in $(or $(ON),python3.11 python3.12 python3.13); do \
-		command -v $$python >/dev/null || { echo "$$python: not on this host"; continue; }; \
-		home=$$(mktemp -d); wheel=$$(ls dist/*.whl); $$python -m venv $$home/env; \
-		$$home/env/bin/pip install --quiet --disable-pip-version-check "$$wheel[gateway,fem,services,metrics]"; \
-		(cd $$home && env/bin/palpate doctor && env/bin/palpate demo --seconds 3 --out demo); \
-		rm -rf $$home; echo "$$python: the wheel works"; \
-	done
+wheel: build  ## try wheel and source archive in fresh environments: make wheel ON="python3.11 python3.13" | 2 min each
+	$(BIN)/python -m tests.install.wheel $(ON)
+
+readers: build  ## play five readers: paste what their pages say, take the time: make readers ONLY="lab robot" | 30 min, Linux only
+	$(BIN)/python -m tests.readers.run $(ONLY)
+	$(BIN)/python docs/make_readers.py
+	$(BIN)/python docs/make_numbers.py
 
 release: $(VENV)/.dev  ## version, changelog and files of a release: make release VERSION=1.2.0 | 20 s
 	@[[ "$(VERSION)" =~ ^[0-9]+\.[0-9]+\.[0-9]+$$ ]] || { echo "say which: make release VERSION=1.2.0"; exit 2; }

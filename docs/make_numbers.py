@@ -10,6 +10,7 @@ figures it has now; it must occur exactly once in the page.
 from __future__ import annotations
 
 import json
+import math
 import re
 import runpy
 import sys
@@ -296,9 +297,50 @@ def _demo() -> Iterator[Claim]:
     )
 
 
+def _readers() -> Iterator[Claim]:
+    """How long the pages take that the index sends its readers to."""
+    index = {
+        "laptop": "[quick start](quick-start.md) | {minutes} + {install} |",
+        "lab": "(first-biotac.md) | {minutes} + {install} emulated",
+        "files": "(guides/train-on-your-files.md) | {minutes} + {install} |",
+        "robot": "[palpate and ROS](ros.md) | {minutes} + {install} |",
+        "mechanics": "(guides/press-the-fingertip.md) | {minutes} + {install} |",
+    }
+    for one in _read("readers.json")["readers"]:
+        if one["reader"] not in index or "found" not in one:
+            continue
+        figures = {
+            "minutes": str(math.ceil(one["minutes"])),
+            "install": str(math.ceil(one["install_minutes"])),
+        }
+        yield Claim("docs/README.md", index[one["reader"]], figures)
+        yield Claim(
+            f"docs/{one['pages'][0]}",
+            ": {minutes} min on two shared cores, and {install} min of installation",
+            figures,
+        )
+
+
+def _wheel() -> Iterator[Claim]:
+    """Where wheel and source archive were tried."""
+    versions = [one["python"] for one in _read("wheel.json")["tried"]]
+    figures = {f"v{number}": version for number, version in enumerate(versions)}
+    names = ", ".join(f"{{v{number}}}" for number in range(len(versions)))
+    yield Claim("docs/releases.md", f"Last tried with CPython {names}:", figures)
+
+
 def claims() -> list[Claim]:
     """Every figure of the documents that a result file holds."""
-    return [*_demo(), *_fem(), *_real_force(), *_twin(), *_serving(), *_restarts()]
+    return [
+        *_demo(),
+        *_fem(),
+        *_real_force(),
+        *_twin(),
+        *_serving(),
+        *_restarts(),
+        *_readers(),
+        *_wheel(),
+    ]
 
 
 def main() -> None:

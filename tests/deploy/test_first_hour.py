@@ -14,21 +14,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from tests.readers.page import blocks_of
+from tests.readers.truth import TOUCH_N, estimates_of, played_loop, truth_at
 
-from palpate.bus import Delivery, Session
-from palpate.bus.topics import FEATURES
 from palpate.config import LinkConfig
 from palpate.files.bundle import read_bundle
-from palpate.messages import FeatureEstimate, QualityFlag
-from palpate_gateway.emulators.twin import RATE_HZ, loop_options, make_loop
+from palpate.messages import QualityFlag
 
 pytest.importorskip("torch")
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 240.0
-
-TOUCH_N = 0.2
-"""As where the presses of a record are read."""
 
 AS_SAID = 1.2
 """Times the bundle's own figure that the error on other presses may be."""
@@ -93,29 +89,15 @@ def start(tmp_path: Path) -> Iterator[Start]:
 def lines(new_port: Callable[[], int]) -> list[str]:
     """The commands of the page, at free ports."""
     page = (ROOT / "docs" / "first-biotac.md").read_text(encoding="utf-8")
-    block = page.partition("## Without hardware")[2].partition("```\n")[2].partition("```")[0]
-    for port in sorted(set(re.findall(r"port=?\s?(\d{5})", block))):
-        block = block.replace(port, str(new_port()))
-    return block.splitlines()
-
-
-def estimates_of(link: LinkConfig, station: str, seconds: float) -> list[FeatureEstimate]:
-    with Session.open(link, station=station) as session:
-        stream = session.subscriber(FEATURES, sensor="finger", delivery=Delivery.QUEUE)
-        time.sleep(seconds)
-        return [one.message for one in stream.next_batch(10, most=100_000)]
+    blocks = blocks_of(page.partition("## Without hardware")[2])
+    text = "\n".join(line for block in blocks if block.language == "sh" for line in block.lines)
+    for port in sorted(set(re.findall(r"port=?\s?(\d{5})", text))):
+        text = text.replace(port, str(new_port()))
+    return text.splitlines()[:3]
 
 
 def correlation(force: Floats, truth: Floats, rows: npt.NDArray[np.bool_]) -> float:
     return float(np.corrcoef(force[rows], truth[rows])[0, 1])
-
-
-def truth_at(wrench: Floats, wall_ns: npt.NDArray[np.int64]) -> Floats:
-    """Magnitudes of the twin's force [N] at times of the host's clock, which plays its loop."""
-    magnitude = np.linalg.norm(wrench[:, :3], axis=1)
-    frames = len(magnitude) - 1
-    at = np.mod(1e-9 * wall_ns, frames / RATE_HZ) * RATE_HZ
-    return np.asarray(np.interp(at, np.arange(frames + 1), magnitude))
 
 
 @pytest.mark.slow
@@ -134,7 +116,7 @@ def test_from_two_devices_to_estimates_as_good_as_said(
     assert "UNCALIBRATED" in said
     profile = (tmp_path / "try.toml").read_text(encoding="utf-8")
     # What the emulators play: they do not hear of the station, nor the station of this.
-    loop = make_loop(loop_options(unit=2, seed=7))
+    loop = played_loop()
     first.wait_for("press 9 of 9")
     said = first.wait_for("the station runs; Ctrl-C stops it")
     served = said[said.index("served: ") :]

@@ -1,84 +1,26 @@
 """The quick start and the guides: every command runs, in order, and prints what its page promises.
 
-A page is Markdown. A block of ``sh`` is run by bash in the page's own folder; a block of ``text``
-after it is what it prints, line for line as far as shown, with ``...`` for what varies; a block of
-another language after ``<!-- file: NAME -->`` is that file. A comment before a block of ``sh`` says
-what else there is to know:
-
-``<!-- not run: REASON -->``          not here, and why
-``<!-- background until: TEXT -->``   goes on in another terminal; the page continues after TEXT
-``<!-- needs data: FOLDER -->``       the rest of the page needs real recordings in ``$DATA``
-``<!-- exits: CODE -->``              fails on purpose
+How a page is read: ``tests/readers/page.py``. What ``make readers`` alone runs is left out here.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from tests.readers.page import Block, blocks_of, missing_lines
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "docs" / "quick-start.md", *sorted((ROOT / "docs" / "guides").glob("*.md"))]
 LIMIT_S = 600.0
 """One block, on a host on which other tests run, too."""
-
-BLOCK = re.compile(
-    r"(?:^<!-- (?P<marks>[^\n]*) -->\n)?^```(?P<language>\w*)\n(?P<text>.*?)^```$",
-    re.MULTILINE | re.DOTALL,
-)
-MARK = re.compile(r"(not run|background until|needs data|exits|file): (.*)")
-
-
-@dataclass(frozen=True, slots=True)
-class Block:
-    """A fenced block of a page."""
-
-    language: str
-    text: str
-    mark: str = ""
-    says: str = ""
-
-    def __str__(self) -> str:
-        return self.text.strip()
-
-
-def blocks_of(page: str) -> list[Block]:
-    """Fenced blocks in order.
-
-    Raises:
-        ValueError: A comment before a block is none of the known marks.
-    """
-    found = []
-    for match in BLOCK.finditer(page):
-        mark, says = "", ""
-        if match["marks"] is not None:
-            known = MARK.fullmatch(match["marks"])
-            if known is None:
-                raise ValueError(f"<!-- {match['marks']} --> is no mark of a block")
-            mark, says = known[1], known[2].strip()
-        found.append(Block(match["language"], match["text"], mark, says))
-    return found
-
-
-def missing_lines(promised: str, printed: str) -> list[str]:
-    """Lines that a page promises and that were not printed, in this order."""
-    lines = iter([" ".join(line.split()) for line in printed.splitlines()])
-    missing = []
-    for promise in promised.splitlines():
-        words = " ".join(promise.split())
-        pattern = ".*".join(re.escape(part.strip()) for part in words.split("..."))
-        if words and words != "..." and not any(re.fullmatch(pattern, line) for line in lines):
-            missing.append(promise)
-    return missing
 
 
 class Terminal:
@@ -101,7 +43,7 @@ class Terminal:
             timeout=LIMIT_S,
             check=False,
         )
-        expected = int(block.says) if block.mark == "exits" else 0
+        expected = int(block.marks.get("exits", 0))
         assert done.returncode == expected, f"$ {block}\nexit {done.returncode}\n{done.stdout}"
         return done.stdout
 
@@ -120,9 +62,10 @@ class Terminal:
             )
         self._running.append(process)
         deadline = time.monotonic() + LIMIT_S
-        while block.says not in (printed := log.read_text(encoding="utf-8", errors="replace")):
+        words = block.marks["background until"]
+        while words not in (printed := log.read_text(encoding="utf-8", errors="replace")):
             assert process.poll() is None, f"$ {block}\nended\n{printed}"
-            assert time.monotonic() < deadline, f"$ {block}\nnever said {block.says!r}\n{printed}"
+            assert time.monotonic() < deadline, f"$ {block}\nnever said {words!r}\n{printed}"
             time.sleep(0.1)
         return printed
 
@@ -189,10 +132,11 @@ def test_every_block_says_what_it_is() -> None:
                 wrong.append(f"{path.name}: a block of {block.language!r}")
             if block.language == "text" and (before is None or before.language != "sh"):
                 wrong.append(f"{path.name}: {block} is printed by no command")
-            if block.language not in {"sh", "text"} and block.mark != "file":
+            if block.language not in {"sh", "text"} and "file" not in block.marks:
                 wrong.append(f"{path.name}: {block} has no name of a file")
-            if block.mark == "not run" and len(block.says.split()) < 2:
-                wrong.append(f"{path.name}: {block} is not run, and no reason says why")
+            for mark in ("not run", "make readers"):
+                if len(block.marks.get(mark, "and why").split()) < 2:
+                    wrong.append(f"{path.name}: {block} is not run, and no reason says why")
             before = block
     assert not wrong
     assert len(PAGES) > 5
@@ -206,19 +150,17 @@ def test_commands_of_a_page_do_what_it_says(
     printed = ""
     with terminal(tmp_path, new_port()) as commands:
         for block in blocks_of(path.read_text(encoding="utf-8")):
-            if (
-                block.mark == "needs data"
-                and not (ROOT.parent / "shared" / "data" / block.says).is_dir()
-            ):
-                pytest.skip(f"the rest needs ../shared/data/{block.says}")
-            if block.mark == "file":
-                file = tmp_path / block.says
+            data = block.marks.get("needs data")
+            if data and not (ROOT.parent / "shared" / "data" / data).is_dir():
+                pytest.skip(f"the rest needs ../shared/data/{data}")
+            if "file" in block.marks:
+                file = tmp_path / block.marks["file"]
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_text(block.text, encoding="utf-8")
-            elif block.mark == "not run":
+            elif block.marks.keys() & {"not run", "make readers"}:
                 printed = ""
             elif block.language == "sh":
-                run = commands.start if block.mark == "background until" else commands.run
+                run = commands.start if "background until" in block.marks else commands.run
                 printed = run(block)
             elif block.language == "text" and printed:
                 missing = missing_lines(block.text, printed)

@@ -142,6 +142,7 @@ def test_palpate_commands_exist(
         "make_install.py",
         "make_models.py",
         "make_numbers.py",
+        "make_readers.py",
         "make_serving.py",
         "make_study.py",
     ],

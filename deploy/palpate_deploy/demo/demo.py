@@ -33,8 +33,8 @@ from palpate_services.viewer.touch_errors import TOUCHED_N, read_touches
 _SENSOR = "finger"
 _REFRESH_S = 0.1
 _LINE_S = 1.0
-_JOIN_S = 15.0
-_FIRST_S = 20.0
+_JOIN_S = 60.0
+_FIRST_S = 60.0
 """A cold host may take this long to import, load, tare and give the first estimates [s]."""
 
 

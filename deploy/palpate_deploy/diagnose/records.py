@@ -178,7 +178,12 @@ def write_foxglove(record: Path, out: Path, *, bundles: Sequence[str] = ()) -> N
 
 
 def error_lines(errors: RecordErrors) -> list[str]:
-    """Errors by force as lines of text: those of touched frames first."""
+    """Errors by force as lines of text, those of touched frames first; or that there are none."""
+    if not errors.all_frames.frames:
+        return [
+            f"{errors.estimates:,} estimates; no force was measured beside them, so that how good "
+            "they are is unknown"
+        ]
     touched = errors.touched
     lines = [
         f"touched (true force {touched.name}): {touched.frames:,} of {errors.estimates:,} "

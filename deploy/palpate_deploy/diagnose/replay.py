@@ -21,7 +21,7 @@ from rich.table import Table
 
 from palpate.bus import Session
 from palpate.bus.topics import ELECTRODES, FEATURES
-from palpate.errors import LinkError, PalpateError, RecordingError
+from palpate.errors import LinkError, PalpateError, RecordingError, printable
 from palpate.files.record import summarise
 from palpate.messages import ServiceState
 from palpate_deploy.diagnose.records import viewer_command
@@ -133,7 +133,7 @@ def as_plain(account: ReplayAccount) -> dict[str, Any]:
 
 def print_account(account: ReplayAccount) -> None:
     """Print the account as a table, and the files."""
-    table = Table(title=str(account.file), title_justify="left", show_header=False)
+    table = Table(title=printable(account.file.name), title_justify="left", show_header=False)
     table.add_column()
     table.add_column(justify="right")
     plain = as_plain(account)
@@ -156,7 +156,7 @@ def print_account(account: ReplayAccount) -> None:
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _BAG_MAGIC = b"#ROSBAG"
 _POLL_S = 0.1
-_JOIN_S = 15.0
+_JOIN_S = 60.0
 _SETTLED_S = 20.0
 _LINGER_S = 1.0
 _ENDED = (ServiceState.FINISHED, ServiceState.DEGRADED)

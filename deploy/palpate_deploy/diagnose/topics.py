@@ -186,7 +186,16 @@ def _readable(value: Any) -> str:
         return "  ".join(f"{key} {item:g}" for key, item in sorted(value.items())) or "-"
     if isinstance(value, enum.Enum):
         return value.name.lower()
-    return json.dumps(plain(value), ensure_ascii=False) if value else str(value)
+    return json.dumps(_short(plain(value)), ensure_ascii=False) if value else str(value)
+
+
+def _short(value: Any) -> Any:
+    """Without what is not given, and without digits that nobody reads."""
+    if isinstance(value, float):
+        return float(f"{value:.4g}")
+    if isinstance(value, dict):
+        return {key: _short(one) for key, one in value.items() if one is not None}
+    return [_short(one) for one in value] if isinstance(value, list) else value
 
 
 _REPORT_S = 1.0

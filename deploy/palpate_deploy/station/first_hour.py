@@ -287,7 +287,9 @@ def _estimate(message: FeatureEstimate) -> str:
     flags = "".join(f", {flag.name}" for flag in message.quality)
     bundle = f"{message.bundle_name}:{message.bundle_version}"
     bounds = message.bounds
-    doubt = "" if bounds is None or bounds.force is None else f" +- {bounds.force:.2f} N"
+    doubt = ", how far off is not known,"
+    if bounds is not None and bounds.force is not None:
+        doubt = f" +- {bounds.force:.2f} N"
     return f"{_newtons(message.force)}{doubt} by {printable(bundle)}{flags}"
 
 

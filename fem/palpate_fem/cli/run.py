@@ -217,6 +217,8 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
 
         def on_report(report: BatchReport) -> None:
             steps = report.done if sweep else sum(report.running.values())
+            if not sweep and report.done:  # it does not run any more
+                steps = total
             bar.update(task, completed=steps + present, info=_outcomes(report))
 
         if store is None:
@@ -346,7 +348,7 @@ def show_trajectory(fingertip: StoredFingertip, trajectory: IndentationResult) -
     places = np.array([trajectory.path[0], *(step.pose for step in trajectory.steps)])
     travel = path_lengths(places)[1:] * 1e3
     print_table(
-        ("step", "travel mm", "|F| N", "Fx", "Fy", "Fz", "p kPa", "area mm²", "Newton"),
+        ("step", "travel mm", "|F| N", "Fx", "Fy", "Fz", "p kPa", "area mm²", "iterations"),
         [
             (
                 str(number + 1),
@@ -362,7 +364,7 @@ def show_trajectory(fingertip: StoredFingertip, trajectory: IndentationResult) -
         title=f"{trajectory.indenter}: {ending}",
         caption=f"{len(fingertip.mesh.nodes):,} nodes, "
         f"fluid {fingertip.fluid_pressure_pa / 1e3:.1f} kPa, "
-        f"{fingertip.total_thickness_m * 1e3:.2f} mm; {trajectory.seconds:.1f} s",
+        f"{fingertip.total_thickness_m * 1e3:.2f} mm thick; {trajectory.seconds:.1f} s",
         numbers_from=0,
     )
 

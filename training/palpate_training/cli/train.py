@@ -298,6 +298,7 @@ def train_features_command(
 
         def on_epoch(quantity: str, done: int, total: int) -> None:
             if quantity not in tasks:
+                _finish(progress)
                 tasks[quantity] = progress.add_task(quantity, total=total)
             progress.update(tasks[quantity], completed=done)
 
@@ -311,6 +312,7 @@ def train_features_command(
             serials=serials or (),
             on_epoch=on_epoch,
         )
+        _finish(progress)
     _show(report.metrics, f"{name} {version}: unseen presses", out)
 
 
@@ -471,6 +473,12 @@ def _progress(to: Console = console) -> Progress:
         TimeElapsedColumn(),
         console=to,
     )
+
+
+def _finish(progress: Progress) -> None:
+    """Fill the bars: a network that learns nothing more ends before its last epoch."""
+    for task in progress.tasks:
+        progress.update(task.id, total=task.completed)
 
 
 def _show(metrics: dict[str, float], title: str, out: Path) -> None:

@@ -28,7 +28,7 @@ from palpate_training.learning.force_process import (
     KnownRows,
 )
 from palpate_training.learning.graphs import FeaturesGraph
-from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
+from palpate_training.learning.intervals import LEVEL, bounds, fit_formulas, terms_of
 from palpate_training.learning.metrics import force_errors, force_metrics
 from palpate_training.learning.ranges import ends_of, known_inputs
 from palpate_training.tasks.features import threshold_above
@@ -145,6 +145,7 @@ def train_finger(
             metrics[f"{other}_{key}"] = found[key]
     presses = len(np.unique(known.press[touched]))
     source = f"{len(known)} rows of {data.provenance.source}"
+    formulas = finger_formulas(held_out[touched], known.force[touched], known.press[touched])
     digest = export_features(
         folder,
         FeaturesGraph(net, force_sd.astype(np.float32)),
@@ -175,8 +176,10 @@ def train_finger(
             f"{source}, each press held out in its turn",
             data.content_sha256(),
             presses,
-            finger_formulas(held_out[touched], known.force[touched], known.press[touched]),
-        ),
+            formulas,
+        )
+        if formulas
+        else None,
     )
     return FingerReport(digest, estimator, metrics, presses, len(known))
 
@@ -186,7 +189,7 @@ STEPS = FOLDS + 1
 
 
 def finger_formulas(held_out: Floats, force: Floats, press: Rows) -> tuple[BoundFormula, ...]:
-    """Bounds of the errors of the next press.
+    """Bounds of the errors of the next press; none that lies beyond every force of the presses.
 
     Args:
         held_out: Forces estimated without the press that is estimated [N], shape ``(N, 3)``.
@@ -197,13 +200,17 @@ def finger_formulas(held_out: Floats, force: Floats, press: Rows) -> tuple[Bound
     size = np.linalg.norm(held_out, axis=1)
     # Its own rows are its training range: they say nothing of how errors grow away from it.
     nothing = np.zeros(len(size))
-    return fit_formulas(
+    terms = terms_of(size, nothing, nothing)
+    formulas = fit_formulas(
         {"force_magnitude": found["magnitude_n"], "force": found["vector_n"]},
-        terms_of(size, nothing, nothing),
+        terms,
         press,
         level=LEVEL,
         use=OF_FINGER if len(np.unique(press)) >= PRESSES_SLOPE else OF_FEW,
     )
+    # Of a few presses that are unlike one another it comes out as hundreds of newtons: unknown.
+    strongest_n = np.linalg.norm(force, axis=1).max()
+    return tuple(one for one in formulas if np.median(bounds(one, terms)) <= strongest_n)
 
 
 OF_FINGER = (True, True, False, False, False)

@@ -1,0 +1,86 @@
+"""Write docs/results/readers.md from docs/results/readers.json.
+
+``python docs/make_readers.py``          writes the page
+``python docs/make_readers.py --check``  exits 1 if the page is not what the file says
+
+``make readers`` plays the readers anew.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+FILE = Path(__file__).parent / "results" / "readers.json"
+PAGE = FILE.with_suffix(".md")
+
+HEAD = """# Five readers
+
+Each follows the page that [the index](../README.md) names, by a program: `make readers` pastes the
+commands of the page, in order, into terminals in a fresh folder with a fresh home, installs the
+wheel of `make build` as the page says, answers what is asked as the page says, and looks at what
+came of it. Hardware is played by the emulators that the page starts. What no program stands in for:
+understanding the page, and a view in a window.
+"""
+
+
+def _row(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |\n"
+
+
+def _summary(readers: list[dict[str, Any]]) -> Iterator[str]:
+    yield _row(["reader has", "page", "minutes", "installation", "promised", "found"])
+    yield _row(["---"] * 6)
+    for one in readers:
+        pages = ", then ".join(f"[{page}](../{page})" for page in one["pages"])
+        if "skipped" in one:
+            yield _row(
+                [one["who"], pages, "-", "-", one["promise"], f"not tried: {one['skipped']}"]
+            )
+            continue
+        found = one["found"] if "failed" not in one else f"**failed**: {one['failed'][:200]}"
+        minutes = [f"{one['minutes']:.1f}", f"{one['install_minutes']:.1f}"]
+        yield _row([one["who"], pages, *minutes, one["promise"], found])
+
+
+def _steps(one: dict[str, Any]) -> Iterator[str]:
+    yield f"\n## {one['who'][0].upper()}{one['who'][1:]}\n\n"
+    yield _row(["command", "s"]) + _row(["---", "---"])
+    for step in one.get("steps", ()):
+        line = step["line"].replace("|", "\\|")
+        yield _row([f"`{line}`", f"{step['seconds']:.1f}"])
+    for text in one.get("left_out", ()):
+        yield f"\nLeft out: {text}.\n"
+
+
+def page(values: dict[str, Any]) -> str:
+    """The page of a result."""
+    readers = values["readers"]
+    least, most = min(values["load"]), max(values["load"])
+    where = (
+        f"Python {values['python']}, {values['cores']} cores, {values['machine']}. Load average "
+        f"before a reader began: {least:.1f} to {most:.1f}; above {values['cores']} the cores are "
+        "shared with other work, and everything takes longer. An installation downloads nothing "
+        "that pip's cache has.\n"
+    )
+    parts = "".join("".join(_steps(one)) for one in readers if "skipped" not in one)
+    return f"{HEAD}\n{''.join(_summary(readers))}\n{where}{parts}"
+
+
+def main() -> int:
+    """Write or check the page; the exit code."""
+    text = page(json.loads(FILE.read_text(encoding="utf-8")))
+    if sys.argv[1:] == ["--check"]:
+        if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != text:
+            sys.stderr.write(f"{PAGE.name} is not what {FILE.name} says: {__doc__}\n")
+            return 1
+        return 0
+    PAGE.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
