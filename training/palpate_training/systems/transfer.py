@@ -332,7 +332,7 @@ class ForceTransfer:
             apart_s = recording.period_s * np.abs(some[:, None] - labelled.rows)
             together = recording.segment[some][:, None] == recording.segment[labelled.rows]
             moment = WANDERING_N2 * together * np.exp(-apart_s / WANDERING_S)
-            return OFFSET_VARIANCE_N2 + place + moment
+            return np.asarray(OFFSET_VARIANCE_N2 + place + moment)
 
         same = labelled.press[:, None] == labelled.press
         inverse = np.linalg.inv(
