@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -142,3 +147,36 @@ def test_a_station_starts_without_its_site_and_finds_it_later(examples: dict[str
                 until(lambda: not up.connected)
             assert up.refusal is None
             stack.close()
+
+
+def test_a_site_that_hangs_does_not_hold_its_stations(examples: dict[str, Any]) -> None:
+    """Its router stands still, as a whole process; stations go on, and robots hear them again."""
+    first = examples["ElectrodeFrame"]
+    numbers = itertools.count(first.stamp.sequence)
+    site = free_endpoint()
+    code = "import sys, threading; from palpate.bus import run_router\n"
+    code += "run_router((sys.argv[1],), threading.Event())"
+    with ExitStack() as stack:
+        process = stack.enter_context(subprocess.Popen([sys.executable, "-c", code, site]))
+        stack.callback(process.kill)
+        link, up = stack.enter_context(station("arm1", site))
+        until(lambda: up.connected)
+        lab = LinkConfig(connect=(site,), wait_for_router_s=PATIENCE_S)
+        robot = stack.enter_context(Session.open(lab, station="arm1"))
+        far = robot.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+        here = stack.enter_context(Session.open(link, station="arm1"))
+        near = here.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
+        gateway = stack.enter_context(Session.open(link, station="arm1"))
+
+        def hears(stream: Any) -> bool:
+            stamp = replace(first.stamp, sequence=next(numbers))
+            return sends(gateway, replace(first, stamp=stamp), stream)
+
+        until(lambda: hears(far))
+        process.send_signal(signal.SIGSTOP)
+        until(lambda: not up.connected)  # after the lease
+        until(lambda: hears(near))
+        process.send_signal(signal.SIGCONT)
+        until(lambda: up.connected)
+        assert up.refusal is None
+        until(lambda: hears(far))
