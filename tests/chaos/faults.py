@@ -158,7 +158,8 @@ def _limit_files(station: ChaosStation) -> Undo:
 def _read_only(station: ChaosStation) -> Undo:
     """What the recorder has open stays open, so it is killed; the next one finds the folder so."""
     main = station.process_of("up").pid
-    inside = ("nsenter", f"--target={main}", "--mount")
+    # With its processes: umount looks itself up in /proc.
+    inside = ("nsenter", f"--target={main}", "--mount", "--pid")
     runs = f"{FOLDER}/runs"
     host(*inside, "mount", "--bind", runs, runs)
     host(*inside, "mount", "-o", "remount,bind,ro", runs)

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.bus.topics import ELECTRODES
-from palpate.errors import PalpateError
-from palpate.files.record import read_record, summarise
+from palpate.errors import PalpateError, WireError
+from palpate.files.record import read_record
 
 KILLED = re.compile(r"kill recorder|hang recorder|disk read-only|kill palpate up|hang palpate up"
                     r"|kill supervisord|hang supervisord|systemctl kill")  # fmt: skip
@@ -30,23 +30,22 @@ def check_recordings(
     recording from before it and the last that the robot got before it [s].
     """
     files = sorted(folder.glob("*.mcap"))
-    readable, stamps, problems, incomplete = 0, [np.empty(0, np.int64)], [], []
+    readable, malformed, problems = 0, 0, []
+    stamps: list[int] = []
     for file in files:
         try:
-            found = [
-                ELECTRODES.codec.decode(item.payload).stamp.monotonic_ns
-                for item in read_record(file)
-                if item.address.topic == ELECTRODES.name
-            ]
-            complete = summarise(file).complete
+            for item in read_record(file):
+                if item.address.topic != ELECTRODES.name:
+                    continue
+                try:
+                    stamps.append(ELECTRODES.codec.decode(item.payload).stamp.monotonic_ns)
+                except WireError:  # what strangers sent is recorded as it came
+                    malformed += 1
         except PalpateError as error:
             problems.append(f"{file.name}: {error.problem}")
-            continue
-        readable += 1
-        stamps.append(np.array(found, np.int64))
-        if not complete:
-            incomplete.append(file.name)
-    recorded = np.sort(np.concatenate(stamps))
+        else:
+            readable += 1
+    recorded = np.sort(np.array(stamps, np.int64))
     lost_s = [
         gap
         for one in events
@@ -60,10 +59,11 @@ def check_recordings(
         "bytes": sum(file.stat().st_size for file in files),
         "readable": readable,
         "problems": problems,
+        "malformed": malformed,
         "recovered": recovered,
         "kills": len(lost_s),
         "ended_without_warning": killed,
-        "look_whole": len(incomplete),
+        "look_whole": len(problems),
         "parts": len(list(folder.glob("*.part"))),
         "frames": len(recorded),
         "repeated": len(recorded) - len(np.unique(recorded)),

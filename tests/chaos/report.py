@@ -104,7 +104,8 @@ def report(work: Path, minutes: float, seed: int) -> dict[str, Any]:
     run = notes.run
     began, ended = run["began_ns"], run["ended_ns"]
     gaps = holes(notes.estimates, began, ended)
-    events = run["events"]
+    events, spoiled = _sound(run)
+    run["events"] = events
     faults = [_fault(kind, notes, gaps) for kind in catalogue()]
     calm = _calm(events, began, ended)
     calm_ns = sum(b - a for a, b in calm)
@@ -150,11 +151,27 @@ def report(work: Path, minutes: float, seed: int) -> dict[str, Any]:
         "uses": run["uses"],
         "zombies": run["zombies"],
         "undone": run["undone"],
+        "spoiled": [one["fault"] for one in spoiled],
         "left": run["left"],
         "secrets": _secrets(work),
     }
     found["goals"] = goals(found)
     return found
+
+
+def _sound(run: dict[str, Any]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The faults, and those that say nothing: this program had not mended what it had broken.
+
+    They go on until all was well again.
+    """
+    failed = {text.partition(":")[0] for text in run["undone"]}
+    sound, spoiled = [], []
+    broken = False
+    for event in run["events"]:
+        broken = broken or event["fault"] in failed
+        (spoiled if broken else sound).append(event)
+        broken = broken and not event["well_ns"]
+    return sound, spoiled
 
 
 def _fault(kind: Fault, notes: Notes, gaps: Rows) -> dict[str, Any]:

@@ -223,6 +223,7 @@ class ChaosStation:
                 )
                 pid, parent = int(entry.name), int(rows["PPid"])
                 command = (entry / "cmdline").read_bytes().decode(errors="replace")
+                command = command or rows["Name"].strip()  # of a zombie no more is known
                 inner = int(rows["NSpid"].split()[-1])
                 state = rows["State"].split()[0]
                 found[pid] = Process(pid, inner, parent, state, command.replace("\0", " "))

@@ -21,7 +21,7 @@ _STATION = f"""
 import sys, threading, time
 from palpate.bus import Session, run_router
 from palpate.bus.topics import STATUS
-from palpate.config import Role
+from palpate.config import LinkConfig, Role
 from palpate.health import Health, HealthReporter
 sys.stdin.readline()
 folder = sys.argv[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import time
 from collections.abc import Callable, Iterator
@@ -264,6 +265,16 @@ def test_unflushed_samples_are_counted_as_lost_when_the_disk_refuses(
         kept = sum(1 for path in (tmp_path / how).glob("*.mcap") for _ in read_record(path))
         assert kept >= 1
         assert health.counters["lost_disk_full"] == sent - kept > 1, how
+
+
+@pytest.mark.parametrize("size", [0, 1, 7])
+def test_part_without_even_a_head_is_removed(tmp_path: Path, size: int) -> None:
+    """A disk that refuses to write leaves one with each attempt."""
+    part = tmp_path / "lab.mcap.part"
+    part.write_bytes(b"\x89MCAP0\r"[:size])
+    os.utime(part, (0, 0))
+    assert recover_all(leftovers(tmp_path)) == []
+    assert not part.exists()
 
 
 def test_leftovers_are_recovered_but_not_those_of_the_living(

@@ -66,6 +66,9 @@ _log = logging.getLogger(__name__)
 PART = ".part"
 RECOVERED = ".recovered.mcap"
 
+_HEAD_BYTES = 8
+"""A smaller part lacks even the mark at the start of every MCAP file: it holds nothing [bytes]."""
+
 
 FRESH_BYTES = 512
 FRESH_S = 10.0
@@ -81,7 +84,7 @@ def leftovers(folder: Path) -> list[Path]:
 
 
 def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> list[Path]:
-    """Recover leftovers; one that cannot be read stays as it is.
+    """Recover leftovers; one that cannot be read stays as it is, one that is empty is removed.
 
     ``stop`` ends the work between two files. Returns the recovered records.
     """
@@ -90,8 +93,10 @@ def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> l
         if stop is not None and stop.is_set():
             break
         try:
-            if part.name.endswith(f"{RECOVERED}{PART}"):
-                part.unlink()  # a recovery that was itself killed; its source is still there
+            # A recovery that was itself killed, its source is still there; or a disk that refused
+            # the first write: each new attempt leaves such a part.
+            if part.name.endswith(f"{RECOVERED}{PART}") or part.stat().st_size < _HEAD_BYTES:
+                part.unlink()
             else:
                 done.append(recover(part))
         except (RecordingError, OSError) as error:
