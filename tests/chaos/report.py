@@ -165,7 +165,8 @@ def _sound(run: dict[str, Any]) -> tuple[list[dict[str, Any]], list[dict[str, An
     They go on until all was well again.
     """
     failed = {text.partition(":")[0] for text in run["undone"]}
-    sound, spoiled = [], []
+    sound: list[dict[str, Any]] = []
+    spoiled: list[dict[str, Any]] = []
     broken = False
     for event in run["events"]:
         broken = broken or event["fault"] in failed
