@@ -169,8 +169,8 @@ finger, no state between frames: what a bundle can hold), tested on all that com
 * *Without the twin's line*: the magnitude starts from a line through 20,000 presses of the
   [twin](population.md), 60 numbers, whose scale and axes the other finger tells. It helps where
   little is known; no network of the twin did. `palpate calibrate` starts from it, too.
-* A press corrects most what lies within some ten seconds before and after it, as baselines wander; an
-  estimate that is made at once has only the presses before it, so it gains less.
+* A press corrects most what lies within some ten seconds before and after it, as baselines wander;
+  an estimate that is made at once has only the presses before it, so it gains less.
 * Its own first minute alone is worse than five presses drawn from the whole recording, beside the
   other finger: within a recording baselines wander, and these fingers are never let go to tare.
 * Its constants were chosen on these two fingers, the worse counting, so the numbers are somewhat
