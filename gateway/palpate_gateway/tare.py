@@ -264,6 +264,11 @@ class TareAttempts:
         for _, future in requested:
             _answer(future, error)
 
+    def resume(self, tare: Tare) -> None:
+        """A tare of the run before is in force again; none is attempted without a request."""
+        self._own = None
+        self.ledger.enter(tare)
+
     def recorded(self, tare: Tare) -> None:
         """A tare of a record is put in force."""
         self.ledger.enter(tare)

@@ -17,6 +17,7 @@ from palpate.bus.topics import ELECTRODES, FEATURES, STATUS
 from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.errors import StreamTimeout
+from palpate.messages import NO_TARE
 from palpate.process import state_folder
 from palpate_deploy.station.processes import command_line
 from palpate_deploy.station.status import show_status
@@ -61,7 +62,9 @@ def test_killed_processes_come_back_and_consumers_resume(
         # One subscription for the whole test: it must outlive every process it hears.
         stream = session.subscriber(FEATURES, sensor="finger", delivery=Delivery.NEWEST)
         recorder_says = session.subscriber(STATUS, service="recorder", delivery=Delivery.NEWEST)
+        frames = session.subscriber(ELECTRODES, sensor="finger", delivery=Delivery.NEWEST)
         stream.next(PATIENCE_S)
+        tare_id = frames.next(PATIENCE_S).message.tare_id
         wait_until(lambda: process_ids(tmp_path).keys() >= ALL, PATIENCE_S, "all processes run")
         for service in ("gateway", "features", "recorder", "router"):
             before = process_ids(tmp_path)[service]
@@ -81,6 +84,8 @@ def test_killed_processes_come_back_and_consumers_resume(
                 pass
             took_s = (time.monotonic_ns() - killed_ns) * 1e-9
             _log.info("%s: process back %.2f s, all flows %.2f s", service, process_s, took_s)
+        assert tare_id != NO_TARE
+        assert frames.next(PATIENCE_S).message.tare_id == tare_id  # a killed gateway keeps it
         _estimates_flow(session, PATIENCE_S)  # and whoever comes now is served as well
     up.send_signal(signal.SIGTERM)
     assert up.wait(timeout=60) == 0

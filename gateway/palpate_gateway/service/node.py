@@ -23,6 +23,7 @@ from palpate_gateway.condition.stillness import StillLimits
 from palpate_gateway.config import GatewayConfig, SensorConfig
 from palpate_gateway.device import BusDevice, Device
 from palpate_gateway.drivers import make_device
+from palpate_gateway.kept_tare import KeptTare
 from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.service.requests import with_caller
 from palpate_gateway.service.sensor_key import ClaimedKey
@@ -81,7 +82,7 @@ def run(
             worker = SensorWorker(
                 sensor.name,
                 device,
-                _pipeline(config, device, session_id),
+                _pipeline(config, sensor.name, device, session_id),
                 {
                     topic.name: session.publisher(topic, sensor=sensor.key_name, lossless=lossless)
                     for topic in (ELECTRODES, WRENCH, POSE, FIELD_TRUTH, TARE)
@@ -136,7 +137,7 @@ def _device(sensor: SensorConfig) -> Device:
     return device
 
 
-def _pipeline(config: GatewayConfig, device: Device, session_id: int) -> Pipeline:
+def _pipeline(config: GatewayConfig, sensor: str, device: Device, session_id: int) -> Pipeline:
     again_s = config.retare_after_s
     return Pipeline(
         device.info,
@@ -145,6 +146,7 @@ def _pipeline(config: GatewayConfig, device: Device, session_id: int) -> Pipelin
         limits=StillLimits(config.tare_max_sd_counts, config.tare_max_pac_sd_counts),
         retare=None if again_s is None else RetareRules(again_s, config.retare_drift_counts),
         session_id=session_id,
+        kept=KeptTare.of(sensor),
     )
 
 

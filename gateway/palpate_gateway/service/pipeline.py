@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
@@ -17,8 +18,11 @@ from palpate_gateway.clock.stamps import ClockMap, DueMessage, Stamper
 from palpate_gateway.condition.condition import Condition, RetareRules
 from palpate_gateway.condition.stillness import StillLimits
 from palpate_gateway.device import DeviceIdentity, DeviceInfo
+from palpate_gateway.kept_tare import KeptTare
 from palpate_gateway.readings import Reading, RecordedMessage
 from palpate_gateway.tare import TARE_FRAMES, TareAttempts, TareLedger, TareMode
+
+_log = logging.getLogger(__name__)
 
 Put = Callable[[DueMessage], None]
 """Takes the next message that is to be published."""
@@ -41,6 +45,8 @@ class Pipeline:
         limits: Noise up to which a sensor counts as still.
         retare: When to tare again without a request; None = never.
         session_id: Names this run of the gateway in the stamps; 0 = unknown.
+        kept: Where the tare of a live sensor is kept for a gateway that is started again; None =
+            nowhere.
     """
 
     def __init__(
@@ -52,7 +58,9 @@ class Pipeline:
         limits: StillLimits | None = None,
         retare: RetareRules | None = None,
         session_id: int = 0,
+        kept: KeptTare | None = None,
     ) -> None:
+        self._kept = kept if info.live and info.sensor_type is not None else None
         self._limits = limits or StillLimits()
         electrodes_only = replace(self._limits, pac_sd=inf, pdc_sd=inf)
         if tare == "first":
@@ -96,7 +104,7 @@ class Pipeline:
 
     def begin(self, identity: DeviceIdentity, clock: ClockMap) -> None:
         """The device was opened, or opened again; sequences go on, and the tares of its finger."""
-        exchanged = identity.serial != self._serial
+        exchanged, first = identity.serial != self._serial, not self._serial
         self._serial = identity.serial
         kind = identity.sensor_type or self._info.sensor_type
         if (exchanged or kind is not self._kind) and self.ledger.current_id != NO_TARE:
@@ -110,6 +118,8 @@ class Pipeline:
         elif self.condition is not None:
             self.condition.begin()
         self._kind = kind
+        if first:
+            self._resume()
         self._published.clear()  # of the time before, perhaps of another finger
         self._stamper.begin(
             clock,
@@ -117,6 +127,16 @@ class Pipeline:
             sensor_type=kind,
             slot_period_s=identity.slot_period_s,
         )
+
+    def _resume(self) -> None:
+        """Go on with the tare of a gateway that was killed, or hung, and that this one replaces."""
+        if self._kept is None or self._kind is None or self.condition is None:
+            return
+        tare = self._kept.find(self._serial, self._kind.layout.electrodes)
+        if tare is not None:
+            _log.info("%s: goes on with tare %d of before the restart", self._serial, tare.tare_id)
+            self._tares.resume(tare)
+            self.condition.tared(tare)
 
     def ask_tare(self, frames: int) -> Future[Tare]:
         """Tare with the next frames (0 = the usual number); may be called from any thread.
@@ -199,6 +219,8 @@ class Pipeline:
         for tare in self._tares.offer(frame):
             if self.condition is not None:
                 self.condition.tared(tare)
+            if self._kept is not None:
+                self._kept.keep(tare)
             # Published before the frames that were held back for it, and due with the first.
             put(DueMessage(TARE.name, tare, self._held[0].due_ns if self._held else due_ns))
             if self._holding:
