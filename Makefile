@@ -162,6 +162,7 @@ release: $(VENV)/.dev  ## version, changelog and files of a release: make releas
 	sed -i 's/^version: .*/version: $(VERSION)/' CITATION.cff
 	sed -i 's/palpate:[0-9][0-9.]*[0-9]/palpate:$(VERSION)/' deploy/containers/* docs/install.md
 	$(BIN)/towncrier build --yes --version $(VERSION)
+	sed -i 's#](\.\./\.\./#](#g; s#](\.\./#](docs/#g' CHANGELOG.md  # fragments lie two folders deeper
 	@$(MAKE) build
 
 clean:  ## remove caches and built files; keep .venv and recordings | 1 s
