@@ -24,10 +24,11 @@ from palpate.bus import Delivery, endpoints
 from palpate.bus.link import open_zenoh
 from palpate.bus.topics import ELECTRODES, ENCODING_PREFIX, FEATURES, sensor_key
 from palpate.client.simulations import straight_path
-from palpate.codec import ERROR, SIMULATION_REQUEST
+from palpate.codec import SIMULATION_REQUEST
 from palpate.config import joining_link
 from palpate.errors import StreamTimeout
 from palpate.messages import SimulationRequest
+from palpate_deploy.bench.faults import reply_code
 
 MANY = 400
 FRAMES, FRAMES_HZ = 5000, 1000.0
@@ -43,15 +44,8 @@ def flood(session: zenoh.Session, sensor: str) -> dict[str, int]:
     path = straight_path((-0.004, 0.0, -0.011), (-0.004, 0.0, -0.0096), 2)
 
     def note(reply: zenoh.Reply) -> None:
-        code = "answered"
-        if reply.err is not None:
-            code = "untyped"
-            if str(reply.err.encoding) == ENCODING_PREFIX + ERROR.schema:
-                code = ERROR.decode(reply.err.payload.to_bytes()).code.name.lower()
-            elif reply.err.payload.to_bytes() == b"Timeout":
-                code = "timeout"
         with lock:
-            codes[code] += 1
+            codes[reply_code(reply)] += 1
 
     for _ in range(MANY):
         request = SimulationRequest(uuid.uuid4().hex, "sphere_7mm", path, deadline_s=5.0)

@@ -16,7 +16,8 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
+
+from palpate.process import Closing
 
 ROWS, COLUMNS = 40, 120
 _DONE = re.compile(r"\x1e(\d+)\x1e")
@@ -85,7 +86,7 @@ class Network:
             self._holder.wait()
 
 
-class Terminal:
+class Terminal(Closing):
     """An interactive bash; its commands and all that they print are kept in ``shown``."""
 
     def __init__(
@@ -109,17 +110,6 @@ class Terminal:
         self._reader = threading.Thread(target=self._follow, daemon=True)
         self._reader.start()
         self._until_prompt(60.0)
-
-    def __enter__(self) -> Terminal:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _follow(self) -> None:
         decoder = codecs.getincrementaldecoder("utf-8")("replace")

@@ -487,6 +487,16 @@ def hostile_payloads(seconds: float) -> tuple[bool, Figures]:
     return account.lost <= 0.01 * account.received and grew < 16 << 20, figures
 
 
+def reply_code(reply: zenoh.Reply) -> str:
+    """``answered``, the code of a typed error, ``timeout``, or ``untyped``."""
+    if reply.err is None:
+        return "answered"
+    content = reply.err.payload.to_bytes()
+    if str(reply.err.encoding) == ENCODING_PREFIX + ERROR.schema:
+        return ERROR.decode(content).code.name.lower()
+    return "timeout" if content == b"Timeout" else "untyped"
+
+
 def query_flood(seconds: float) -> tuple[bool, Figures]:
     """A hundred times more questions than the gateway can hold: refused, typed, and soon over."""
     many = 1600
@@ -505,15 +515,8 @@ def query_flood(seconds: float) -> tuple[bool, Figures]:
         lock = threading.Lock()
 
         def note(reply: zenoh.Reply) -> None:
-            code = "answered"
-            if reply.err is not None:
-                code = "untyped"
-                if str(reply.err.encoding) == ENCODING_PREFIX + ERROR.schema:
-                    code = ERROR.decode(reply.err.payload.to_bytes()).code.name.lower()
-                elif reply.err.payload.to_bytes() == b"Timeout":
-                    code = "timeout"
             with lock:
-                codes[code] += 1
+                codes[reply_code(reply)] += 1
 
         mark = station.observer.mark()
         for _ in range(many):
