@@ -50,21 +50,24 @@ Mended:
   which nobody can reach there. It now joins as a client of the router
   (`tests/deploy/test_other_host.py` has two networks).
 * A disk that refuses to write left an empty `.mcap.part` with each attempt, for ever, and each
-  start of the recorder warned of each. They are removed now; the files of the run on this page are
-  from before.
+  start of the recorder warned of each. They are removed now.
 * A disk for the recordings alone, mounted below the station's folder, keeps systemd 257 from
   starting the unit. [install.md](../install.md) says where a disk of its own belongs.
 * In the namespaces of `make debian`, credentials did not reach a unit, because mounts were not
   shared as container managers share them. Now they do: `LoadCredential` by role is what all
   processes of this run live by.
 
+Mended after the run on this page, whose times have it still:
+
+* A gateway that was started again while the finger was touched took no tare until it was let go, and
+  without a tare there is no estimate. It goes on with its last tare now
+  ([tare and health](../tare-and-health.md)).
+
 Not mended:
 
-* A gateway that is started while the finger is touched takes no tare until it is let go, and
-  without a tare there is no estimate. The emulated finger is pressed again and again, so a killed
-  gateway takes longer than 3 s.
-* Two zombies were seen at the end. The run did not note whose they were (it does now): they may be
-  of the programs that break things.
+* Three zombies called `palpate` are seen at the end. Nobody knows whose children they are: the
+  station's, or those of the programs that break things.
+* A full disk is told in the status and counted, and of four times one is not in the log.
 * A process that hangs is gone for others after the lease of a link, which is 2 s by default; the
   reference measured with 1 s. On a busy host a shorter one takes links down that are well.
 * On a machine that is busy with other things, everything that starts Python anew waits for a
