@@ -59,8 +59,8 @@ Mended:
 
 Mended after the run on this page, whose times have it still:
 
-* A gateway that was started again while the finger was touched took no tare until it was let go, and
-  without a tare there is no estimate. It goes on with its last tare now
+* A gateway that was started again while the finger was touched took no tare until it was let go,
+  and without a tare there is no estimate. It goes on with its last tare now
   ([tare and health](../tare-and-health.md)).
 
 Not mended:
