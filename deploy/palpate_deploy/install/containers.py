@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -108,6 +108,21 @@ def write_containers(order: InstallOrder, folder: Path) -> None:
     """
     plan, profile = make_plan(order, STATE, "/opt/palpate/bin/palpate")
     texts = container_files(plan, profile, present_version())
+    write_files(folder, texts)
+    print("next, with docker:")
+    print(f"  docker compose --file {folder / 'compose.yaml'} up --detach")
+    print("or with podman 5 or newer, as root:")
+    print(f"  cp {folder}/*.container /etc/containers/systemd/")
+    print(f"  install -D -m 644 {folder / plan.name}.toml {profile_path(plan.name)}")
+    print(f"  systemctl daemon-reload && systemctl start palpate-{plan.name}")
+
+
+def write_files(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write texts by the names of their files, and say so; none if another file lies there.
+
+    Raises:
+        ConfigError: One does.
+    """
     for name, text in texts.items():
         file = folder / name
         if file.exists() and file.read_text(encoding="utf-8") != text:
@@ -116,12 +131,6 @@ def write_containers(order: InstallOrder, folder: Path) -> None:
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
         print(f"wrote   {folder / name}")
-    print("next, with docker:")
-    print(f"  docker compose --file {folder / 'compose.yaml'} up --detach")
-    print("or with podman 5 or newer, as root:")
-    print(f"  cp {folder}/*.container /etc/containers/systemd/")
-    print(f"  install -D -m 644 {folder / plan.name}.toml {profile_path(plan.name)}")
-    print(f"  systemctl daemon-reload && systemctl start palpate-{plan.name}")
 
 
 def _compose(plan: ServicePlan, containers: Sequence[_Container], image: str) -> str:

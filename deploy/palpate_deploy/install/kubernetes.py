@@ -14,7 +14,7 @@ from typing import Any
 
 from palpate.config import endpoint_host_port, is_loopback
 from palpate.errors import ConfigError
-from palpate_deploy.install.containers import USER
+from palpate_deploy.install.containers import USER, write_files
 from palpate_deploy.install.plan import checked_name, present_version
 from palpate_deploy.install.units import FEM
 from palpate_deploy.station.processes import check_packages, role_of
@@ -52,14 +52,7 @@ def write_manifests(profile: str, folder: Path, *, name: str = "", replicas: int
         name,
         replicas=replicas,
     )
-    for file, text in texts.items():
-        there = folder / file
-        if there.exists() and there.read_text(encoding="utf-8") != text:
-            raise ConfigError(f"{there} is there, and is another one", remedy="name another folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    for file, text in texts.items():
-        (folder / file).write_text(text, encoding="utf-8")
-        print(f"wrote   {folder / file}")
+    write_files(folder, texts)
     print("next, once for each role that runs there, router and service:")
     print("  kubectl create secret generic palpate-router --from-file=lab-certs/router")
     print("  kubectl create secret generic palpate-service --from-file=lab-certs/service")

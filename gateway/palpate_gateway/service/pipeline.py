@@ -219,10 +219,10 @@ class Pipeline:
         for tare in self._tares.offer(frame):
             if self.condition is not None:
                 self.condition.tared(tare)
-            if self._kept is not None:
-                self._kept.keep(tare)
             # Published before the frames that were held back for it, and due with the first.
             put(DueMessage(TARE.name, tare, self._held[0].due_ns if self._held else due_ns))
+            if self._kept is not None:
+                self._kept.keep(tare)
             if self._holding:
                 self._release(tare.tare_id, put)
         if self._held_frames >= _HELD_WINDOWS * self.tare_frames:
