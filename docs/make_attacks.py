@@ -36,8 +36,8 @@ virtual finger and one robot's poses, on one host; the attackers are Zenoh sessi
 files. [security.md](../security.md) says what each stands for.
 
 *Refused*: the attack had no effect, and the station went on with the same processes. *Logged*: the
-first words of the line in the log of a process, or the counter. "nowhere" means that Zenoh drops
-the message and says so neither to us nor in its own log.
+first words of the line in the log of a process, or the counter. Who `refused: a message of` names,
+a line of the router's log says: address, role, id.
 
 | attack | refused | the attacker is told | logged |
 |---|---|---|---|
@@ -157,7 +157,7 @@ def _row(name: str, outcome: Outcome) -> str:
     )
     told += f" ({numbers})" if numbers else ""
     verdict = "yes" if outcome.refused else "**no**"
-    return f"| {name} | {verdict} | {told} | {_short(outcome.logged) or 'nowhere'} |"
+    return f"| {name} | {verdict} | {told} | {_short(outcome.logged) or '**nowhere**'} |"
 
 
 def main() -> None:

@@ -18,9 +18,10 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.x509.oid import NameOID
 from tests.hostile.lab import LIVE_S, STATION, Heard, Lab, copy_of_bundle, raw
+from tests.hostile.victim import Victim
 
 from palpate.admin import new_nonce, signed
-from palpate.bus import endpoints
+from palpate.bus import Session, endpoints
 from palpate.bus.link import open_zenoh
 from palpate.bus.topics import SensorClaim, claim_key, sensor_key, service_key
 from palpate.client.estimates import ask_tare
@@ -225,13 +226,15 @@ def forging(holder: str, *streams: str) -> Callable[[Lab], Outcome]:
             session = stack.enter_context(lab.join(holder))
             heard = [stack.enter_context(Heard(lab.operator, key)) for key in keys]
             time.sleep(QUIET_S)
+            since = lab.lengths()
             for _ in range(20):
                 for key in keys:
                     raw(session).put(key, FORGED)
                 time.sleep(0.05)
             time.sleep(QUIET_S)
             reached = sum(one.payloads.count(FORGED) for one in heard)
-        return Outcome(not reached, "nothing", "", {"sent": 20 * len(keys), "heard": reached})
+            logged = lab.told_refused(holder, since)
+        return Outcome(not reached, "nothing", logged, {"sent": 20 * len(keys), "heard": reached})
 
     attack.__doc__ = f"Whoever has the certificate of a {holder} publishes {', '.join(streams)}."
     return attack
@@ -239,51 +242,54 @@ def forging(holder: str, *streams: str) -> Callable[[Lab], Outcome]:
 
 def robot_tares(lab: Lab) -> Outcome:
     """A robot tares a finger."""
-    key = sensor_key(STATION, "finger", "tare")
-    with Heard(lab.operator, key) as tares:
-        says = error_of(lambda: ask_tare(lab.robot, "finger", frames=5, timeout_s=3.0))
+    key, since = sensor_key(STATION, "finger", "tare"), lab.lengths()
+    with lab.robot() as robot, Heard(lab.operator, key) as tares:
+        says = error_of(lambda: ask_tare(robot, "finger", frames=5, timeout_s=3.0))
         time.sleep(QUIET_S)
         # A gateway that was asked refuses, too, if the finger is touched: by a RemoteError.
-        return Outcome(says.startswith("LinkError") and not tares.payloads, says, "")
+        logged = lab.told_refused("robot", since)
+        return Outcome(says.startswith("LinkError") and not tares.payloads, says, logged)
 
 
 def robot_loads(lab: Lab) -> Outcome:
     """A robot that has stolen the admin token loads a model."""
-    before = served(lab)
-    thief = ModelAdmin(lab.robot, lab.token)
-    says = error_of(lambda: thief.load("features", "features-twin"))
-    return Outcome(bool(says) and served(lab) == before, says, "")
+    before, since = served(lab), lab.lengths()
+    with lab.robot() as robot:
+        thief = ModelAdmin(robot, lab.token)
+        says = error_of(lambda: thief.load("features", "features-twin"))
+        logged = lab.told_refused("robot", since)
+    return Outcome(bool(says) and served(lab) == before, says, logged)
 
 
 def robot_claims(lab: Lab) -> Outcome:
     """A robot shows an older claim on a finger, to make its gateway give it up."""
     claim = SensorClaim(STATION, "finger", 1, True, 1, "gateway", "thief", "X")
-    before, since = lab.counter("features", "estimates_published"), len(lab.log("gateway"))
-    token = raw(lab.robot).liveliness().declare_token(claim_key(claim))
-    try:
+    before, since = lab.counter("features", "estimates_published"), lab.lengths()
+    with lab.robot() as robot:
+        token = raw(robot).liveliness().declare_token(claim_key(claim))
         time.sleep(3 * QUIET_S)
         after = lab.counter("features", "estimates_published")
-    finally:
         token.undeclare()
-    given_up = "already published" in lab.log("gateway")[since:]
+        logged = lab.told_refused("robot", since)
+    given_up = "already published" in lab.log("gateway")[since["gateway"] :]
     fine = not given_up and after > before
-    return Outcome(fine, "nothing", "", {"estimates_meanwhile": after - before})
+    return Outcome(fine, "nothing", logged, {"estimates_meanwhile": after - before})
 
 
 def robot_answers(lab: Lab) -> Outcome:
     """A robot answers in the place of the features service."""
-    key = _status_key("features")
-    answer = raw(lab.robot).declare_queryable(key, lambda query: query.reply(key, FORGED))
-    try:
+    key, since = _status_key("features"), lab.lengths()
+    with lab.robot() as robot:
+        answer = raw(robot).declare_queryable(key, lambda query: query.reply(key, FORGED))
         time.sleep(QUIET_S)
         found = [
             reply.ok.payload.to_bytes()
             for reply in raw(lab.operator).get(key, timeout=5.0, target=zenoh.QueryTarget.ALL)
             if reply.ok is not None
         ]
-    finally:
         answer.undeclare()
-    return Outcome(FORGED not in found, "nothing", "", {"answers": len(found)})
+        logged = lab.told_refused("robot", since)
+    return Outcome(FORGED not in found, "nothing", logged, {"answers": len(found)})
 
 
 def robot_routes(lab: Lab) -> Outcome:
@@ -292,14 +298,14 @@ def robot_routes(lab: Lab) -> Outcome:
     with ExitStack() as stack:
         router = open_zenoh(lab.link("robot", connect=(), listen=(endpoint,)), "router")
         stack.callback(router.close)
-        victim = stack.enter_context(lab.join("service", honest=True, connect=(endpoint,)))
-        frames = stack.enter_context(Heard(victim, FRAMES))
+        victim = stack.enter_context(Victim(lab.certificates / "service", endpoint, FRAMES))
         time.sleep(QUIET_S)
         for _ in range(10):
             router.put(FRAMES, FORGED)
         time.sleep(QUIET_S)
-        numbers = {"sent": 10.0, "heard": float(len(frames.payloads))}
-        return Outcome(victim.has_router() and not frames.payloads, "nothing", "", numbers)
+        heard, log = victim.end()
+    logged = next((line for line in log if "refused: a message of" in line), "")
+    return Outcome(not heard, "nothing", logged, {"sent": 10.0, "heard": float(heard)})
 
 
 def served(lab: Lab) -> list[str]:
@@ -324,10 +330,7 @@ def command(lab: Lab, *, wall_ns: int | None = None, bundle: str = "features-twi
     return ModelCommand(ModelAction.LOAD, STATION, "features", new_nonce(), now, bundle=bundle)
 
 
-def give(
-    lab: Lab, request: ModelRequest, *, by: str = "operator"
-) -> Sequence[ModelInventory | PalpateError]:
-    session = lab.operator if by == "operator" else lab.robot
+def give(session: Session, request: ModelRequest) -> Sequence[ModelInventory | PalpateError]:
     return session.query_all(
         endpoints.MODELS, request, service="features", instance="features", timeout_s=LIVE_S
     )
@@ -335,7 +338,7 @@ def give(
 
 def refused_command(lab: Lab, request: ModelRequest, counter: str = "commands_denied") -> Outcome:
     before, count = served(lab), lab.counter("features", counter)
-    answers = give(lab, request)
+    answers = give(lab.operator, request)
     says = "; ".join(
         f"{type(one).__name__} {one.code.name}: {one.problem}"
         for one in answers
@@ -349,7 +352,7 @@ def refused_command(lab: Lab, request: ModelRequest, counter: str = "commands_de
 def replayed_command(lab: Lab) -> Outcome:
     """The bytes of an operator's load command are sent again, by an operator's certificate."""
     request = signed(command(lab), lab.token)
-    if not isinstance(give(lab, request)[0], ModelInventory):
+    if not isinstance(give(lab.operator, request)[0], ModelInventory):
         raise AssertionError("the operator's own command is not obeyed")
     ModelAdmin(lab.operator, lab.token).roll_back("features")
     return refused_command(lab, request)
@@ -358,11 +361,13 @@ def replayed_command(lab: Lab) -> Outcome:
 def replayed_by_robot(lab: Lab) -> Outcome:
     """The bytes of an operator's load command are sent again by a robot."""
     request = signed(command(lab), lab.token)
-    give(lab, request)
+    give(lab.operator, request)
     ModelAdmin(lab.operator, lab.token).roll_back("features")
-    before = served(lab)
-    answers = give(lab, request, by="robot")
-    return Outcome(not answers and served(lab) == before, "no answer", "")
+    before, since = served(lab), lab.lengths()
+    with lab.robot() as robot:
+        answers = give(robot, request)
+        logged = lab.told_refused("robot", since)
+    return Outcome(not answers and served(lab) == before, "no answer", logged)
 
 
 def old_command(lab: Lab) -> Outcome:

@@ -147,16 +147,43 @@ def oversize(lab: Lab) -> Outcome:
     key = sensor_key(STATION, "arm", "robot_pose")
     pid = lab.processes()["gateway"]
     before, bytes_before = lab.counter("features", "estimates_published"), resident_bytes(pid)
-    with Heard(lab.operator, key) as heard:
+    since = lab.lengths()
+    with lab.robot() as robot, Heard(lab.operator, key) as heard:
         for _ in range(20):
             for size in (100_000, 5 << 20):
-                raw(lab.robot).put(key, b"\x00" * size)
+                raw(robot).put(key, b"\x00" * size)
         time.sleep(2 * QUIET_S)
         largest = max(map(len, heard.payloads), default=0)
+        logged = lab.told_refused("robot", since)
     grown = (resident_bytes(pid) - bytes_before) / 1e6
     says = f"nothing; the largest that arrived has {largest} bytes"
     fine = not largest and grown < 100 and lab.goes_on(before)
-    return Outcome(fine, says, "", {"gateway_grew_mb": round(grown, 1)})
+    return Outcome(fine, says, logged, {"gateway_grew_mb": round(grown, 1)})
+
+
+def flood_of_refusals(lab: Lab) -> Outcome:
+    """A robot publishes electrodes, which it may not, as fast as it can."""
+    pids = lab.processes()
+    before, since = lab.counter("features", "estimates_published"), lab.lengths()
+    bytes_before = resident_bytes(pids["features"])
+    frames = sensor_key(STATION, "finger", "electrodes")
+    sent, end_s = 0, time.monotonic() + FLOOD_S
+    with lab.robot() as robot:
+        while time.monotonic() < end_s:
+            raw(robot).put(frames, b"\xff" * 200)
+            sent += 1
+        during = lab.counter("features", "estimates_published") - before
+        logged = lab.told_refused("robot", since)
+    grown = (resident_bytes(pids["features"]) - bytes_before) / 1e6
+    lines = sum(lab.log(one)[since[one] :].count("refused") for one in since)
+    numbers = {
+        "sent_per_s": round(sent / FLOOD_S),
+        "estimates_per_s": round(during / FLOOD_S, 1),
+        "features_grew_mb": round(grown, 1),
+        "lines_of_log": lines,
+    }
+    fine = grown < 300 and lines < 100 and lab.goes_on(before + during)
+    return Outcome(fine, "nothing", logged, numbers)
 
 
 def flood_of_messages(lab: Lab) -> Outcome:
@@ -164,12 +191,12 @@ def flood_of_messages(lab: Lab) -> Outcome:
     key, pid = sensor_key(STATION, "arm", "robot_pose"), lab.processes()["gateway"]
     before, bytes_before = lab.counter("features", "estimates_published"), resident_bytes(pid)
     sent, end_s = 0, time.monotonic() + FLOOD_S
-    publisher = raw(lab.robot).declare_publisher(key)
-    while time.monotonic() < end_s:
-        publisher.put(b"\xff" * 200)
-        sent += 1
-    publisher.undeclare()
-    during = lab.counter("features", "estimates_published") - before
+    with lab.robot() as robot:
+        publisher = raw(robot).declare_publisher(key)
+        while time.monotonic() < end_s:
+            publisher.put(b"\xff" * 200)
+            sent += 1
+        during = lab.counter("features", "estimates_published") - before
     grown = (resident_bytes(pid) - bytes_before) / 1e6
     numbers = {
         "sent_per_s": round(sent / FLOOD_S),
@@ -196,16 +223,17 @@ def flood_of_questions(lab: Lab) -> Outcome:
     asked = 3000
     answers: list[zenoh.Reply] = []
     began_s = time.monotonic()
-    for _ in range(asked):
-        raw(lab.robot).get(
-            key,
-            answers.append,
-            payload=b"\xff" * 100,
-            encoding="application/protobuf;palpate.v1.FeatureRequest",
-            timeout=LIVE_S,
-        )
-    with suppress(TimeoutError):
-        lab.wait(lambda: len(answers) >= asked, "each is answered")
+    with lab.robot() as robot:
+        for _ in range(asked):
+            raw(robot).get(
+                key,
+                answers.append,
+                payload=b"\xff" * 100,
+                encoding="application/protobuf;palpate.v1.FeatureRequest",
+                timeout=LIVE_S,
+            )
+        with suppress(TimeoutError):
+            lab.wait(lambda: len(answers) >= asked, "each is answered")
     seconds = time.monotonic() - began_s
     codes = Counter(
         ERROR.decode(reply.err.payload.to_bytes()).code.name

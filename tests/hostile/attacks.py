@@ -35,6 +35,7 @@ from tests.hostile.attack_load import (
     crafted_recordings,
     flood_of_messages,
     flood_of_questions,
+    flood_of_refusals,
     hostile_model_folders,
     oversize,
     path_traversal,
@@ -72,22 +73,6 @@ ATTACKS: dict[str, Callable[[Lab], Outcome]] = {
     "path traversal": path_traversal,
     "oversize messages": oversize,
     "flood of messages": flood_of_messages,
+    "flood of refused messages": flood_of_refusals,
     "flood of questions": flood_of_questions,
 }
-
-SILENT = frozenset(
-    {
-        "robot sends frames and estimates",
-        "gateway sends estimates",
-        "service sends frames",
-        "operator sends frames",
-        "robot tares",
-        "robot loads a model",
-        "robot claims a finger",
-        "robot answers for a service",
-        "robot plays the router",
-        "command replayed by a robot",
-        "oversize messages",
-    }
-)
-"""Attacks that the station refuses and does not log: Zenoh 1.10 tells of none of these."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from palpate_deploy.station.host import free_endpoint
 
 LIVE_S = 60.0
 STATION = "attacked"
+_LOGS = ("router", "gateway", "features")
 
 _PROFILE = """
 station = "{station}"
@@ -92,7 +94,6 @@ class Lab(Closing):
         self._sessions = contextlib.ExitStack()
         try:
             self.operator = self._sessions.enter_context(self.join("operator", honest=True))
-            self.robot = self._sessions.enter_context(self.join("robot", connect=(self.outside,)))
             self.wait(self._serves, "the station serves")
         except BaseException:
             self.close()
@@ -114,6 +115,13 @@ class Lab(Closing):
     def join(self, holder: str, *, honest: bool = False, **changes: Any) -> Session:
         """A session of that holder; see ``link``."""
         return Session.open(self.link(holder, honest=honest, **changes), station=STATION)
+
+    def robot(self) -> Session:
+        """A session of a robot that has just come; of the same one only the first refusal is told.
+
+        It comes from outside, and does not keep to its role.
+        """
+        return self.join("robot", connect=(self.outside,))
 
     def _serves(self) -> bool:
         features = self.status("features")
@@ -146,6 +154,32 @@ class Lab(Closing):
 
         deadline = time.monotonic() + 10.0
         while not (line := find()) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        return line
+
+    def lengths(self) -> dict[str, int]:
+        """How long the log of each process is now [characters]."""
+        return {service: len(self.log(service)) for service in _LOGS}
+
+    def told_refused(self, role: str, since: Mapping[str, int]) -> str:
+        """The line of any log that says that messages are refused of somebody; waits for it.
+
+        Who it is, the router's log says: somebody with the certificate of that role.
+        """
+        line = ""
+
+        def find() -> bool:
+            nonlocal line
+            for service in since:
+                for line in self.log(service)[since[service] :].splitlines():
+                    found = re.search(r"refused: a message of ([0-9a-f]+):", line)
+                    if found and f"joins: {role} (id {found[1]}" in self.log("router"):
+                        return True
+            line = ""
+            return False
+
+        deadline = time.monotonic() + 10.0
+        while not find() and time.monotonic() < deadline:
             time.sleep(0.1)
         return line
 

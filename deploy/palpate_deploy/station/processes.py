@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import faulthandler
 import functools
 import logging
@@ -14,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Self
 
-from palpate.config import Role
+from palpate.config import LinkConfig, Role
 from palpate.errors import ConfigError, PalpateError
 from palpate.process import check_installed
 from palpate_deploy.station import logs
@@ -61,8 +62,16 @@ def run_service(service: Service, profile: Profile) -> None:
     stop = stop_on_signals()
     end_with_parent()
     _log.info("%s starts, station %s", service, profile.station)
-    _run(service, profile, stop)
+    link = profile.link.as_role(role_of(service))
+    with _refusal_log() if link.has_roles else contextlib.nullcontext():
+        _run(service, profile, link, stop)
     _log.info("%s ends", service)
+
+
+def _refusal_log() -> contextlib.AbstractContextManager[object]:
+    from palpate.bus.refusals import RefusalLog
+
+    return RefusalLog()
 
 
 def role_of(service: Service) -> Role:
@@ -72,8 +81,7 @@ def role_of(service: Service) -> Role:
     return Role.GATEWAY if service == "gateway" else Role.SERVICE
 
 
-def _run(service: Service, profile: Profile, stop: threading.Event) -> None:
-    link = profile.link.as_role(role_of(service))
+def _run(service: Service, profile: Profile, link: LinkConfig, stop: threading.Event) -> None:
     if service == "router":
         from palpate_deploy.station.site import run_station_router
 

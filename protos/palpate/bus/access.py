@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-import zenoh
-
 from palpate.bus.endpoints import ENDPOINTS
 from palpate.bus.topics import (
     ASKING_ROOT,
@@ -33,8 +31,6 @@ from palpate.config import Role
 
 ROLE_OF = {role.common_name: role for role in Role}
 """Roles by the common name of a certificate."""
-
-_LOG = "error,zenoh_link_tls=warn,zenoh_transport=warn"
 
 DOOR_PROTOCOL = "unixsock-stream"
 """Protocol of the router's own door, through which it asks itself (``router``)."""
@@ -219,15 +215,6 @@ def settings() -> dict[str, Any]:
         },
         "low_pass_filter": list(_filters()),
     }
-
-
-def log_refusals() -> None:
-    """Let Zenoh write to standard output, in this process, which links no certificate opened.
-
-    Of messages that a role may not send, Zenoh 1.10 writes nothing at any level. ``RUST_LOG`` sets
-    something else.
-    """
-    zenoh.init_log_from_env_or(_LOG)
 
 
 def _rule(

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import zenoh
 
-from palpate.bus.access import DOOR_PROTOCOL, DOOR_ROOT, ROLE_OF, log_refusals
+from palpate.bus.access import DOOR_PROTOCOL, DOOR_ROOT, ROLE_OF
 from palpate.bus.claims import SensorClaims
 from palpate.bus.link import Session, open_zenoh, zenoh_config
 from palpate.bus.topics import STATION_ROOT
@@ -71,8 +71,6 @@ def run_router(
     """
     base = link or LinkConfig()
     config = LinkConfig(connect=(), listen=tuple(listen), lease_s=base.lease_s, tls=base.tls)
-    if config.has_roles:
-        log_refusals()
     with ExitStack() as stack:
         guard = None if site is None else stack.enter_context(_NameGuard(site, config))
         if guard is not None:
@@ -164,7 +162,10 @@ _CLOSE_S = 5.0
 
 
 class _GuestLog(Closing):
-    """Writes into the log who comes and goes, by which certificate; without ``roles`` nothing."""
+    """Writes into the log who comes and goes, by which certificate; without ``roles`` nothing.
+
+    The id is that of ``refusals``.
+    """
 
     def __init__(self, router: zenoh.Session, *, roles: bool) -> None:
         self._listener = None
@@ -179,12 +180,15 @@ class _GuestLog(Closing):
         role = ROLE_OF.get(name or "")
         if role is None and came:
             _log.warning(
-                "%s joins with the certificate %r, which has no role: all that it sends is refused",
+                "%s joins with the certificate %r, which has no role: all that it sends is refused "
+                "(id %s)",
                 link.dst,
                 name,
+                link.zid,
             )
         else:
-            _log.info("%s %s: %s", link.dst, "joins" if came else "leaves", role or name)
+            words = "joins" if came else "leaves"
+            _log.info("%s %s: %s (id %s)", link.dst, words, role or name, link.zid)
 
     def close(self) -> None:
         """Stop writing."""
