@@ -279,6 +279,18 @@ def test_presses_at_random_are_executed_on_some_of_the_specimens(tmp_path: Path)
     assert provenance_sha256(every, four, "") != provenance_sha256(spec, four, "")
 
 
+def test_the_command_takes_points_a_seed_and_specimens(tmp_path: Path) -> None:
+    units, out = tmp_path / "units.json", tmp_path / "few"
+    write_population(units, draw_members(2, 3), source="drawn")
+    words = ["generate", str(out), "--points", "1", "--angled", "0", "--seed", "11"]
+    words += ["--units", str(units), "--edge-mm", "1.2", "--indenter", "sphere_medium"]
+    done = CliRunner().invoke(twin_app, [*words, "--workers", "1"])
+    assert done.exit_code == 0, done.output
+    spec = json.loads((out / SPEC_FILE).read_text())["spec"]
+    assert (spec["points"], spec["angled"], spec["seed"]) == (1, 0, 11)
+    assert read_mixed(out / MIXED).experiment.unit_names == ("unit-001", "unit-002")
+
+
 def test_fingertips_have_skins_presses_and_specimens_of_their_own(tmp_path: Path) -> None:
     runner, units, out = CliRunner(), tmp_path / "units.json", tmp_path / "several"
     write_population(units, draw_members(4, 3), source="drawn")
@@ -440,10 +452,12 @@ def test_sample_is_small_and_playable_and_the_rest_lacks_it(
             tmp_path / "a.npz",
             tmp_path / "rest",
         )
-    trajectories, _ = make_sample(
-        generated.folder, specimens(), FemSimulator(), tmp_path / "s.h5", tmp_path / "t.npz"
-    )
-    assert set(trajectories) == set(generated.data.mixed.experiment.trajectories)
+    words = ["sample", str(generated.folder), "--dataset", str(tmp_path / "s.h5")]
+    words += ["--tape", str(tmp_path / "t.npz")]
+    refused = CliRunner().invoke(twin_app, [*words, "--rest", str(tmp_path / "rest")])
+    assert refused.exit_code != 0
+    done = CliRunner().invoke(twin_app, words, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
     small, whole = read_mixed(tmp_path / "s.h5"), generated.data.mixed
     np.testing.assert_array_equal(small.experiment.tared, whole.experiment.tared)
     rows = slice(0, len(whole))

@@ -154,6 +154,15 @@ def test_a_study_of_paths_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) ->
     assert fem("study", "paths", "--png", "a.png").exit_code == 2
 
 
+def test_the_bench_tells_times_and_rates_of_the_solver() -> None:
+    done = fem("bench", "--json", "--edge-mm", 1.5, "--layers", 1)
+    assert done.exit_code == 0
+    told = json.loads(done.stdout)
+    assert told["solver.solve_s"] > 0.0
+    assert told["solver.factor_gflops"] > 0.0
+    assert told["memory.peak_mib"] > 0.0
+
+
 def test_a_sweep_is_resumed_and_drawn(tmp_path: Path) -> None:
     store, png = tmp_path / "a.sim", tmp_path / "a.png"
     words = ("run", "--sweep", "--points", 1, "--steps", 3, "--store", store, "--workers", 2)

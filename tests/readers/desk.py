@@ -107,6 +107,10 @@ class Desk:
         else:
             terminal = self._front
         printed = ""
+        if "each until" in block.marks:
+            for line in block.run:
+                printed += self._until(terminal, line, block.marks["each until"])
+            return printed
         for number, line in enumerate(block.run, 1):
             printed += self._line(terminal, line, block, last=number == len(block.run))
         if install:
@@ -143,6 +147,12 @@ class Desk:
         self.printed[line] = text
         return text
 
+    def _until(self, terminal: Terminal, line: str, text: str) -> str:
+        """Run a command that goes on; Ctrl-C as soon as it has printed the text."""
+        block = Block("sh", line, {"background until": text})
+        printed = self._line(terminal, line, block, last=True)
+        return printed + _ended(line, terminal)
+
     def _pasted(self, text: str) -> str:
         """Text of a page as it is written here."""
         for there, here in self._here.items():
@@ -165,12 +175,22 @@ class Desk:
             Unexpected: A program shows a traceback when it is ended.
         """
         for line, terminal in reversed(self._running):
-            _code, text = terminal.interrupt(LIMIT_S)
-            if "Traceback" in text:
-                raise Unexpected(f"$ {line}\nCtrl-C\n{text}")
+            _ended(line, terminal)
         self._running.clear()
 
     def log(self) -> str:
         """What all terminals showed."""
         parts = [f"==== terminal {n}\n{plain(one.shown)}\n" for n, one in enumerate(self._all, 1)]
         return "".join(parts)
+
+
+def _ended(line: str, terminal: Terminal) -> str:
+    """Ctrl-C; what the command still said.
+
+    Raises:
+        Unexpected: It shows a traceback.
+    """
+    _code, text = terminal.interrupt(LIMIT_S)
+    if "Traceback" in text:
+        raise Unexpected(f"$ {line}\nCtrl-C\n{text}")
+    return text

@@ -21,7 +21,8 @@ class Words:
     """What a command line is made of, without its values.
 
     Attributes:
-        commands: The program's subcommands in order, e.g. ``("data", "generate")``.
+        commands: The program's subcommands in order, e.g. ``("data", "generate")``, or the target of
+            make as the Makefile writes it.
         options: Its long options, e.g. ``{"--out"}``.
     """
 
@@ -35,12 +36,12 @@ def words_of(line: str, palpate: Any) -> Words:
     Raises:
         ValueError: The line is of another program, of which no test can be expected.
     """
-    program, *words = shlex.split(line, comments=True)
+    program, *words = shlex.split(line.removeprefix("sudo "), comments=True)
     if Path(program).name not in {"palpate", "make"}:
         raise ValueError(f"{line}: only palpate and make are run elsewhere")
     options = frozenset(word.partition("=")[0] for word in words if word.startswith("--"))
     if program == "make":
-        return Words((program, *(word for word in words if "=" not in word)), options)
+        return Words(tuple(f"{word}:" for word in words if "=" not in word), options)
     commands: list[str] = []
     for word in words:
         if word.startswith("-") or not hasattr(palpate, "commands"):
@@ -105,6 +106,8 @@ class _Speaker(ast.NodeVisitor):
     def says(self, commands: tuple[str, ...]) -> bool:
         """Whether the commands stand one after another."""
         length = len(commands)
+        if commands[0].endswith(":"):
+            return any(re.search(rf"(?<!\w){commands[0]}", word) for word in self.words)
         if length == 1:
             return commands[0] in self.whole
         starts = range(len(self.words) - length + 1)

@@ -9,6 +9,7 @@ there is to know; several are parted by ``; ``:
 ``<!-- not run: REASON -->``          by no test, and why
 ``<!-- installs: FROM WHERE -->``     makes an environment
 ``<!-- background until: TEXT -->``   goes on in another terminal; the page continues after TEXT
+``<!-- each until: TEXT -->``         each command goes on until TEXT and Ctrl-C
 ``<!-- answers: ONE | TWO -->``       what is typed where it asks; only Enter = nothing between
 ``<!-- stand-in for: FILE -->``       makes what one has not who has FILE
 ``<!-- needs data: FOLDER -->``       the rest of the page needs real recordings in ``$DATA``
@@ -29,7 +30,7 @@ BLOCK = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 MARK = re.compile(
-    r"(run by|not run|installs|background until|answers|stand-in for|needs data|exits|file):(?: (.*))?"
+    r"(run by|not run|installs|background until|each until|answers|stand-in for|needs data|exits|file):(?: (.*))?"
 )
 
 
