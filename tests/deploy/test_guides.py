@@ -1,4 +1,4 @@
-"""Quick start, first hour and guides: every command runs, in order, and prints what its page promises.
+"""Quick start, first hour, guides: every command runs, and prints what its page promises.
 
 How a page is read: ``tests/readers/page.py``; how its commands run: ``tests/readers/desk.py``.
 """

@@ -1,4 +1,4 @@
-"""Pages that are no guides: what stands on them as a command runs, in order, and prints what is said.
+"""Pages that are no guides: their commands run, in order, and print what is promised.
 
 Which of their commands are run by another test, or by none: ``tests/house/test_pages.py``.
 """

@@ -22,8 +22,8 @@ from tests.fem.batched_cases import DEVICE
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError, RemoteError
-from palpate_fem.calibration.runs import PlannedPath
 from palpate_deploy.cli.app import app
+from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.cli import model as cli_model
 from palpate_fem.cli.run import show_report
 from palpate_fem.config import FingertipParameters

@@ -1,4 +1,4 @@
-"""Every command of the documentation site is run: as pasted, by a test that is named, or not, and why.
+"""Every command of the site is run: as pasted, by a test that is named, or not, and why.
 
 How a page is read: ``tests/readers/page.py``. What is run as pasted is run by
 ``tests/deploy/test_guides.py`` and ``tests/deploy/test_pages.py``; this file looks at all else.
@@ -21,18 +21,20 @@ from tests.readers.page import Block, blocks_of
 from palpate_deploy.cli.app import app
 
 COMMAND = re.compile(
-    r"^\s*(?:\$ )?(?:sudo|(?:[\w./-]*/)?(?:palpate|python3?|pip3?|make|git|docker|podman|kubectl|systemctl|"
-    r"journalctl|ros2|rerun|source|export|cd|cp|mkdir|rm|ls|cat|echo|apt|apt-get|npm|openssl|curl|"
+    r"^\s*(?:\$ )?(?:sudo|(?:[\w./-]*/)?(?:palpate|python3?|pip3?|make|git|docker|podman|kubectl|"
+    r"systemctl|journalctl|ros2|rerun|source|export|cd|cp|mkdir|rm|ls|cat|echo|apt|apt-get|npm|openssl|curl|"
     r"ssh|scp|chronyc|ptp4l|phc2sys|pmc|ip|pytest|pre-commit|ruff|ray|nvidia-smi))(?: [^=]|$)",
     re.MULTILINE,
 )
 """How a line begins that a reader would paste."""
 
+INDENTED = re.compile(r"^ +.*", re.MULTILINE)
+
 LANGUAGES = {"", "sh", "text", "python", "toml", "ini", "csv", "c"}
 
 NOT_RUN = {
     "chronyc", "docker build", "docker compose", "export", "ip", "kubectl apply",
-    "kubectl create", "make audit", "make quick", "make setup", "phc2sys", "pmc", "pre-commit",
+    "kubectl create", "make audit", "make quick", "make setup", "mkdir", "phc2sys", "pmc", "pre-commit",
     "ptp4l", "rerun", "ros2 topic", "sudo pip", "sudo python3", "sudo rm", "sudo systemctl",
 }  # fmt: skip
 """All that no test runs. A page says of each why, and which other program does, if one does."""
@@ -67,7 +69,7 @@ def problems_of(page: str, blocks: list[Block]) -> list[str]:
         if block.language not in LANGUAGES:
             wrong.append(f"{block}: a block of {block.language!r}")
         # What a command prints may tell others, indented.
-        text = block.text if block.language != "text" else re.sub(r"^ +.*", "", block.text, 0, re.M)
+        text = block.text if block.language != "text" else INDENTED.sub("", block.text)
         if block.language in {"", "text"} and COMMAND.search(text):
             wrong.append(f"{block}: has a command; say sh")
         if block.language == "text" and (before is None or before.language != "sh"):
@@ -194,8 +196,10 @@ def test_a_file_that_does_not_run_it_is_noticed(
 
 def test_a_mark_of_some_lines_leaves_the_others() -> None:
     text = "palpate status\npalpate top   # live\npalpate tare finger\n# a comment\n"
-    block = Block("sh", text, {"run by": "tests/a.py [palpate top]", "not run": "asks [palpate ta]"})
+    block = Block(
+        "sh", text, {"run by": "tests/a.py [palpate top]", "not run": "it asks [palpate ta]"}
+    )
     assert block.run == ["palpate status"]
-    assert block.left_out["palpate tare finger"] == [("not run", "asks")]
+    assert block.left_out["palpate tare finger"] == [("not run", "it asks")]
     with pytest.raises(ValueError, match="no line begins"):
         _ = Block("sh", text, {"not run": "never [palpate down]"}).run

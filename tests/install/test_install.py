@@ -12,7 +12,6 @@ import pytest
 from tests.install.cases import PROFILES, VIRTUAL
 from tests.install.conftest import PROGRAM, Install
 from tests.install.image import contents, difference
-
 from typer.testing import CliRunner, Result
 
 from palpate.config import Role, TlsConfig

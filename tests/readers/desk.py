@@ -1,4 +1,4 @@
-"""A reader's desk: the terminals in which the commands of a page run, line by line, and what came."""
+"""A reader's desk: terminals in which the commands of a page run, line by line."""
 
 from __future__ import annotations
 

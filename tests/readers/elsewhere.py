@@ -21,8 +21,8 @@ class Words:
     """What a command line is made of, without its values.
 
     Attributes:
-        commands: The program's subcommands in order, e.g. ``("data", "generate")``, or the target of
-            make as the Makefile writes it.
+        commands: The program's subcommands in order, e.g. ``("data", "generate")``, or
+            the target of make as the Makefile writes it.
         options: Its long options, e.g. ``{"--out"}``.
     """
 
@@ -55,8 +55,8 @@ def runs(file: Path, line: str, palpate: Any) -> bool:
     """Whether a test, another page or the script of continuous integration runs the line's words.
 
     A test may say them in one text or in several, and may enter at a group of commands
-    (``runner.invoke(fem_app, ["run", "--sweep"])``). A command of one word has to be a text of its own,
-    since prose is full of such words.
+    (``runner.invoke(fem_app, ["run", "--sweep"])``). A command of one word has to be a text of its
+    own, since prose is full of such words.
     """
     if file.suffix == ".md" and not _known(line):
         return line.partition(" #")[0].strip() in _pasted(file)

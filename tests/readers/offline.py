@@ -1,8 +1,8 @@
 """A desk without a network: what a page installs comes from this checkout and this environment.
 
-The page's own ``python3 -m venv``, ``pip install`` and ``make demo`` run. pip gets palpate from a wheel of
-this checkout; everything else stands beside it already, as the packages of the environment that
-runs the tests.
+The page's own ``python3 -m venv``, ``pip install`` and ``make demo`` run. pip gets palpate from a
+wheel of this checkout; everything else stands beside it already, as the packages of the environment
+that runs the tests.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from pathlib import Path
 
 from tests.readers.desk import Desk
 from tests.readers.page import blocks_of
-from tests.readers.terminal import plain
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
@@ -69,7 +68,7 @@ def offline_desk(folder: Path, port: int) -> Iterator[Desk]:
 
 
 def _commands(folder: Path) -> Path:
-    """A folder with `palpate`, `python` and `pip`: those of this interpreter, also if not installed."""
+    """A folder with `palpate`, `python` and `pip` of this interpreter, also if not installed."""
     commands = folder / "commands"
     commands.mkdir()
     path = os.pathsep.join([str(folder / "installed"), *filter(None, sys.path)])

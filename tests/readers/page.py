@@ -1,11 +1,11 @@
 """What a page of the documentation tells its reader to do: its commands, files and promises.
 
-A page is Markdown. A block of ``sh`` is run in the page's own folder, line by line; a block of ``text``
-behind it is what it prints, line for line as far as shown, with ``...`` for what varies; a block of
-another language after ``<!-- file: NAME -->`` is that file. A comment before a block says what else
-there is to know; several are parted by ``; ``:
+A page is Markdown. A block of ``sh`` is run in the page's own folder, line by line; a block of
+``text`` behind it is what it prints, line for line as far as shown, with ``...`` for what varies; a
+block of another language after ``<!-- file: NAME -->`` is that file. A comment before a block says
+what else there is to know; several are parted by ``; ``:
 
-``<!-- run by: FILE, FILE -->``       what runs the same commands with the same options, if not as pasted
+``<!-- run by: FILE, FILE -->``       not as pasted, but there, with the same commands and options
 ``<!-- not run: REASON -->``          by no test, and why
 ``<!-- installs: FROM WHERE -->``     makes an environment
 ``<!-- background until: TEXT -->``   goes on in another terminal; the page continues after TEXT
@@ -15,8 +15,8 @@ there is to know; several are parted by ``; ``:
 ``<!-- needs data: FOLDER -->``       the rest of the page needs real recordings in ``$DATA``
 ``<!-- exits: CODE -->``              fails on purpose
 
-The first two may be of some lines only: ``FILE [palpate top | palpate tare]``, ``REASON [docker]`` is of
-the lines that begin so. The others are run.
+The first two may be of some lines only: ``FILE [palpate top | palpate tare]``, ``REASON [docker]``
+are of the lines that begin so. The others are run.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 BLOCK = re.compile(
-    r"(?:^<!-- (?P<marks>[^\n]*) -->\n)?^```(?P<language>\w*)\n(?P<text>.*?)^```$",
+    r"(?:^<!--\s(?P<marks>(?:(?!-->|```).)*)\s-->\n)?^```(?P<language>\w*)\n(?P<text>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
 MARK = re.compile(
-    r"(run by|not run|installs|background until|each until|answers|stand-in for|needs data|exits|file):(?: (.*))?"
+    r"(run by|not run|installs|background until|each until|answers|stand-in for|needs data|exits|"
+    r"file):(?: (.*))?"
 )
 
 
@@ -95,10 +96,11 @@ def blocks_of(page: str) -> list[Block]:
     found = []
     for match in BLOCK.finditer(page):
         marks = {}
-        for mark in (match["marks"] or "").split("; ") if match["marks"] is not None else ():
+        comment = None if match["marks"] is None else " ".join(match["marks"].split())
+        for mark in comment.split("; ") if comment is not None else ():
             known = MARK.fullmatch(mark)
             if known is None:
-                raise ValueError(f"<!-- {match['marks']} --> is no mark of a block")
+                raise ValueError(f"<!-- {comment} --> is no mark of a block")
             marks[known[1]] = (known[2] or "").strip()
         found.append(Block(match["language"], match["text"], marks))
     return found
