@@ -38,7 +38,6 @@ from palpate_training.experiment.generate.pipeline import (
     provenance_sha256,
 )
 from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
-from palpate_training.experiment.generate.sample import make_sample
 from palpate_training.experiment.generate.simulator import ExperimentSpec, Specimen
 from palpate_training.experiment.generate.workers import WorkerProcesses
 
@@ -51,15 +50,17 @@ SPEC_SHA256 = "dd2ae706a05ce458ab10708f60fefe6e2157f61f3c62a7cdc46175729a96b891"
 """Of `SPEC`: data sets without paths other than presses keep their digest."""
 
 
-def specimens() -> tuple[Specimen, ...]:
+def members() -> tuple[Member, ...]:
     """Two units, one of which was pressed deeper than planned."""
     unit = replace(SpecimenParameters(), noise_counts=1.0)
-    return specimens_of(
-        (
-            Member(replace(unit, name="biotac-1", sigma_s_m=0.16), PAPER[0], 0.2e-3),
-            Member(replace(unit, name="biotac-2"), PAPER[1], 0.0),
-        )
+    return (
+        Member(replace(unit, name="biotac-1", sigma_s_m=0.16), PAPER[0], 0.2e-3),
+        Member(replace(unit, name="biotac-2"), PAPER[1], 0.0),
     )
+
+
+def specimens() -> tuple[Specimen, ...]:
+    return specimens_of(members())
 
 
 def run(folder: Path) -> GeneratedExperiment:
@@ -443,19 +444,17 @@ def test_sample_is_small_and_playable_and_the_rest_lacks_it(
     generated: GeneratedExperiment, tmp_path: Path
 ) -> None:
     """One normal and one angled press: here that is all there is, so nothing is left."""
-    with pytest.raises(DatasetError):
-        make_sample(
-            generated.folder,
-            specimens(),
-            FemSimulator(),
-            tmp_path / "a.h5",
-            tmp_path / "a.npz",
-            tmp_path / "rest",
-        )
     words = ["sample", str(generated.folder), "--dataset", str(tmp_path / "s.h5")]
     words += ["--tape", str(tmp_path / "t.npz")]
-    refused = CliRunner().invoke(twin_app, [*words, "--rest", str(tmp_path / "rest")])
-    assert refused.exit_code != 0
+    with pytest.raises(DatasetError, match="no trials of biotac-3"):
+        CliRunner().invoke(twin_app, words, catch_exceptions=False)
+    units = tmp_path / "units.json"
+    write_population(units, members(), source="made by a test")
+    words += ["--units", str(units)]
+    with pytest.raises(DatasetError):
+        CliRunner().invoke(
+            twin_app, [*words, "--rest", str(tmp_path / "rest")], catch_exceptions=False
+        )
     done = CliRunner().invoke(twin_app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     small, whole = read_mixed(tmp_path / "s.h5"), generated.data.mixed

@@ -1,4 +1,4 @@
-"""Quick start, first hour, guides: every command runs, and prints what its page promises.
+"""Guides: every command runs, in order, and prints what its page promises.
 
 How a page is read: ``tests/readers/page.py``; how its commands run: ``tests/readers/desk.py``.
 """
@@ -14,12 +14,7 @@ from tests.readers.page import Block, blocks_of, missing_lines
 from tests.readers.terminal import Unexpected
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [
-    ROOT / "docs" / "quick-start.md",
-    ROOT / "docs" / "first-biotac.md",
-    ROOT / "docs" / "ros.md",
-    *sorted((ROOT / "docs" / "guides").glob("*.md")),
-]
+PAGES = sorted((ROOT / "docs" / "guides").glob("*.md"))
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="terminals need Linux")
 

@@ -1,4 +1,4 @@
-"""Pages that are no guides: their commands run, in order, and print what is promised.
+"""Pages that are no guides, quick start and first hour among them: their commands run.
 
 Which of their commands are run by another test, or by none: ``tests/house/test_pages.py``.
 """

@@ -22,9 +22,9 @@ from tests.fem.batched_cases import DEVICE
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError, RemoteError
-from palpate_deploy.cli.app import app
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.cli import model as cli_model
+from palpate_fem.cli.app import fem_app
 from palpate_fem.cli.run import show_report
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
@@ -447,7 +447,7 @@ def test_a_full_disk_ends_the_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def command(*words: object) -> Any:
-    return CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
+    return CliRunner().invoke(fem_app, ["run", *map(str, words)], catch_exceptions=False)
 
 
 @pytest.mark.parametrize(
@@ -465,7 +465,7 @@ def test_what_cannot_be_meant_is_refused_at_once(
 ) -> None:
     monkeypatch.setattr(device_batch, "DeviceProcess", None)  # nothing may be started
     with pytest.raises(ConfigError, match=said):
-        command("fem", "run", *words)
+        command(*words)
 
 
 def test_devices_that_there_are_are_listed() -> None:
@@ -483,13 +483,13 @@ def test_the_command_says_what_ran_where(tmp_path: Path, monkeypatch: pytest.Mon
         "--sweep", "--points", 1, "--steps", 3, "--store", tmp_path / "a.sim", "--indenter", "cube",
         "--device", "cpu", "--device", "cpu", "--slots", 4, "--friction", fakes.QUICK,
     )  # fmt: skip
-    done = command("fem", "run", *words)
+    done = command(*words)
     assert done.exit_code == 0
     said = " ".join(done.stdout.split())
     assert "5 of 5 run: 5 complete;" in said
     assert "ms a trajectory on cpu, cpu" in said
     assert "on the CPU" not in said
-    again = " ".join(command("fem", "run", *words).stdout.split())
+    again = " ".join(command(*words).stdout.split())
     assert "5 were there already" in again
     assert "ms a trajectory" not in again
 

@@ -73,8 +73,10 @@ def _commands(folder: Path) -> Path:
     commands.mkdir()
     path = os.pathsep.join([str(folder / "installed"), *filter(None, sys.path)])
     run = f'PYTHONPATH="{path}" exec "{sys.executable}"'
+    # A profile that is installed says itself where its router listens.
+    installed = '[ "$1" = install ] && unset PALPATE_ROUTER__LISTEN\n'
     texts = {
-        "palpate": f'{run} -m palpate_deploy "$@"',
+        "palpate": f'{installed}{run} -m palpate_deploy "$@"',
         "python": f'{run} "$@"',
         "python3": f'exec "{sys.executable}" "$@"',  # to make environments with
         "pip": f'PIP_TARGET="{folder / "installed"}" {run} -m pip "$@"',
