@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.readers.offline import follow, offline_desk
+from tests.readers.offline import build_wheel, follow, offline_desk
 from tests.readers.page import Block, blocks_of, missing_lines
 from tests.readers.terminal import Unexpected
 
@@ -27,6 +27,20 @@ def test_commands_of_a_page_do_what_it_says(
     left_out = follow(path, tmp_path, new_port())
     if any(text.startswith("the rest of") for text in left_out):
         pytest.skip(left_out[-1])
+
+
+@pytest.mark.slow
+def test_what_a_page_installs_is_what_it_runs(tmp_path: Path, free_port: int) -> None:
+    build_wheel(tmp_path / "dist")
+    made = ["python3 -m venv env", "source env/bin/activate", "pip install -f dist palpate"]
+    asked = ["which palpate", 'python -c "import palpate, zenoh; print(palpate.__file__)"']
+    with offline_desk(tmp_path, free_port) as desk:
+        before = desk.do(Block("sh", asked[0]))
+        desk.do(Block("sh", "\n".join(made), {"installs": "from the package index"}))
+        after = desk.do(Block("sh", "\n".join(asked)))
+    assert f"{tmp_path}/commands/palpate" in before
+    assert f"{tmp_path}/env/bin/palpate" in after
+    assert f"{tmp_path}/env/lib" in after
 
 
 def test_what_a_page_promises_has_to_be_printed() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from tests.deploy.test_guides import PAGES as GUIDES
+from tests.readers.desk import CHECKOUT
 from tests.readers.offline import follow
 from tests.readers.page import blocks_of
 
@@ -27,4 +28,6 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="termina
 @pytest.mark.slow
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_commands_of_a_page_run(path: Path, tmp_path: Path, new_port: Callable[[], int]) -> None:
+    if CHECKOUT in path.read_text(encoding="utf-8") and not (ROOT / ".git").exists():
+        pytest.skip("no git checkout to clone from")
     follow(path, tmp_path, new_port())

@@ -346,8 +346,9 @@ def test_serve_answers_until_it_is_told_to_stop(link: LinkConfig) -> None:
             asker.start()
             asker.join(PATIENCE_S)
             assert errors[0].code.name == "UNAVAILABLE"
-        _, said = process.communicate(timeout=PATIENCE_S)
+        output, said = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0
+        assert "ready for requests" in output + said
         assert "Traceback" not in said
     finally:
         process.kill()

@@ -13,6 +13,8 @@ from typing import Any
 from tests.readers.page import Block, blocks_of, missing_lines
 from tests.readers.terminal import Terminal, Unexpected, plain
 
+CHECKOUT = "<this repository>"
+"""Where a page says to clone from."""
 LIMIT_S = 1200.0
 """For one command, on a host with other work."""
 

@@ -15,12 +15,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.readers.desk import Desk
+from tests.readers.desk import CHECKOUT, Desk
 from tests.readers.page import blocks_of
+from tests.readers.readers import DATA, ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
-DATA = ROOT.parent / "shared" / "data"
-CHECKOUT = "<this repository>"
 ROUTER = "127.0.0.1:7447"
 """Where a station listens if its profile says nothing else."""
 OWN = ("palpate", "_editable_impl_palpate", "_palpate", "pip", "setuptools", "distutils-precedence")
@@ -34,7 +32,7 @@ def follow(path: Path, folder: Path, port: int) -> list[str]:
         Unexpected: Something is not as the page says.
     """
     if any("installs" in block.marks for block in blocks_of(path.read_text(encoding="utf-8"))):
-        _build_wheel(folder / "dist")
+        build_wheel(folder / "dist")
     with offline_desk(folder, port) as desk:
         left_out = desk.follow(path)
         desk.end_page()
@@ -100,7 +98,7 @@ def _packages(folder: Path) -> str:
     return os.pathsep.join([str(packages), *below])
 
 
-def _build_wheel(dist: Path) -> None:
+def build_wheel(dist: Path) -> None:
     """What `make build` writes there."""
     program = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(dist)]
     done = subprocess.run(

@@ -21,7 +21,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from tests.readers.desk import Desk
+from tests.readers.desk import CHECKOUT, Desk
 from tests.readers.readers import DATA, READERS, ROOT, Reader, Visit
 from tests.readers.terminal import Network, Unexpected
 
@@ -29,7 +29,6 @@ OUT = ROOT / "docs" / "results" / "readers.json"
 LOGS = ROOT / "build" / "readers"
 KEPT = ("PIP_", "SSL_", "CURL_", "REQUESTS_", "HTTP_", "HTTPS_", "NO_PROXY", "OPENBLAS_")
 """Settings of this host's network and processor, which a reader has, too."""
-CHECKOUT = "<this repository>"
 
 
 def environment(home: Path) -> dict[str, str]:
