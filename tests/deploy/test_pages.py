@@ -1,6 +1,6 @@
 """Pages that are no guides, quick start and first hour among them: their commands run.
 
-Which of their commands are run by another test, or by none: ``tests/house/test_pages.py``.
+Which of their commands are run by another test, or by none: ``tests/house/test_page_commands.py``.
 """
 
 from __future__ import annotations
