@@ -126,6 +126,7 @@ def test_a_station_that_trusts_a_key_imports_what_it_has_signed(
     refused = palpate("model", "import", imported, "--profile", trusting)
     assert refused.returncode != 0
     assert "sign" in refused.stderr
+    assert "mine" in palpate("model", "card", imported).stdout
     signed = palpate("model", "sign", imported, "--key", key)
     assert signed.returncode == 0, signed.stderr
     done = palpate("model", "import", imported, "--profile", trusting)

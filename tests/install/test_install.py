@@ -87,6 +87,10 @@ def test_the_commands_show_write_and_remove_a_station(
     assert shown.exit_code == 0, shown.output
     assert UNIT in shown.stdout
     assert difference(before, contents(root)) == []
+    files = tmp_path / "files"
+    done = CliRunner().invoke(app, ["install", str(profile), "--containers", str(files)])
+    assert done.exit_code == 0, done.output
+    assert (files / "compose.yaml").exists()
     done = palpate("install", profile, "--program", PROGRAM)
     assert done.exit_code == 0, done.output
     assert f"wrote   /{UNIT}" in done.stdout
