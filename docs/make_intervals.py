@@ -550,7 +550,9 @@ bound of 90 % holds in 90 ± 3 % of the rows, each press counting the same.
 
 The presses are made by
 
-```
+<!-- run by: tests/deploy/test_generate.py [palpate data], docs/twin.md [palpate fem]; not run:
+     the folders are made by the lines beside it [mkdir] -->
+```sh
 palpate data generate runs/calibrate --points 3 --angled 2 --seed 11
 palpate data generate runs/check --points 2 --angled 2 --seed 12
 palpate data generate runs/test --points 2 --angled 2 --seed 13

@@ -38,7 +38,6 @@ from palpate_training.experiment.generate.pipeline import (
     provenance_sha256,
 )
 from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
-from palpate_training.experiment.generate.sample import make_sample
 from palpate_training.experiment.generate.simulator import ExperimentSpec, Specimen
 from palpate_training.experiment.generate.workers import WorkerProcesses
 
@@ -51,15 +50,17 @@ SPEC_SHA256 = "dd2ae706a05ce458ab10708f60fefe6e2157f61f3c62a7cdc46175729a96b891"
 """Of `SPEC`: data sets without paths other than presses keep their digest."""
 
 
-def specimens() -> tuple[Specimen, ...]:
+def members() -> tuple[Member, ...]:
     """Two units, one of which was pressed deeper than planned."""
     unit = replace(SpecimenParameters(), noise_counts=1.0)
-    return specimens_of(
-        (
-            Member(replace(unit, name="biotac-1", sigma_s_m=0.16), PAPER[0], 0.2e-3),
-            Member(replace(unit, name="biotac-2"), PAPER[1], 0.0),
-        )
+    return (
+        Member(replace(unit, name="biotac-1", sigma_s_m=0.16), PAPER[0], 0.2e-3),
+        Member(replace(unit, name="biotac-2"), PAPER[1], 0.0),
     )
+
+
+def specimens() -> tuple[Specimen, ...]:
+    return specimens_of(members())
 
 
 def run(folder: Path) -> GeneratedExperiment:
@@ -279,6 +280,18 @@ def test_presses_at_random_are_executed_on_some_of_the_specimens(tmp_path: Path)
     assert provenance_sha256(every, four, "") != provenance_sha256(spec, four, "")
 
 
+def test_the_command_takes_points_a_seed_and_specimens(tmp_path: Path) -> None:
+    units, out = tmp_path / "units.json", tmp_path / "few"
+    write_population(units, draw_members(2, 3), source="drawn")
+    words = ["generate", str(out), "--points", "1", "--angled", "0", "--seed", "11"]
+    words += ["--units", str(units), "--edge-mm", "1.2", "--indenter", "sphere_medium"]
+    done = CliRunner().invoke(twin_app, [*words, "--workers", "1"])
+    assert done.exit_code == 0, done.output
+    spec = json.loads((out / SPEC_FILE).read_text())["spec"]
+    assert (spec["points"], spec["angled"], spec["seed"]) == (1, 0, 11)
+    assert read_mixed(out / MIXED).experiment.unit_names == ("unit-001", "unit-002")
+
+
 def test_fingertips_have_skins_presses_and_specimens_of_their_own(tmp_path: Path) -> None:
     runner, units, out = CliRunner(), tmp_path / "units.json", tmp_path / "several"
     write_population(units, draw_members(4, 3), source="drawn")
@@ -431,19 +444,19 @@ def test_sample_is_small_and_playable_and_the_rest_lacks_it(
     generated: GeneratedExperiment, tmp_path: Path
 ) -> None:
     """One normal and one angled press: here that is all there is, so nothing is left."""
+    words = ["sample", str(generated.folder), "--dataset", str(tmp_path / "s.h5")]
+    words += ["--tape", str(tmp_path / "t.npz")]
+    with pytest.raises(DatasetError, match="no trials of biotac-3"):
+        CliRunner().invoke(twin_app, words, catch_exceptions=False)
+    units = tmp_path / "units.json"
+    write_population(units, members(), source="made by a test")
+    words += ["--units", str(units)]
     with pytest.raises(DatasetError):
-        make_sample(
-            generated.folder,
-            specimens(),
-            FemSimulator(),
-            tmp_path / "a.h5",
-            tmp_path / "a.npz",
-            tmp_path / "rest",
+        CliRunner().invoke(
+            twin_app, [*words, "--rest", str(tmp_path / "rest")], catch_exceptions=False
         )
-    trajectories, _ = make_sample(
-        generated.folder, specimens(), FemSimulator(), tmp_path / "s.h5", tmp_path / "t.npz"
-    )
-    assert set(trajectories) == set(generated.data.mixed.experiment.trajectories)
+    done = CliRunner().invoke(twin_app, words, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
     small, whole = read_mixed(tmp_path / "s.h5"), generated.data.mixed
     np.testing.assert_array_equal(small.experiment.tared, whole.experiment.tared)
     rows = slice(0, len(whole))

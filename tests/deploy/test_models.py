@@ -115,6 +115,25 @@ def test_import_load_and_roll_back(
     assert "admin token" in done.stderr
 
 
+def test_a_station_that_trusts_a_key_imports_what_it_has_signed(
+    palpate: Palpate, imported: Path, station: tuple[Path, LinkConfig], tmp_path: Path
+) -> None:
+    profile, _ = station
+    key = tmp_path / "lab-signing.key"
+    assert palpate("model", "key", key).returncode == 0
+    trusting = tmp_path / "trusting.toml"
+    trusting.write_text(f'{profile.read_text()}\n[models]\ntrusted_keys = ["{key}.pub"]\n')
+    refused = palpate("model", "import", imported, "--profile", trusting)
+    assert refused.returncode != 0
+    assert "sign" in refused.stderr
+    assert "mine" in palpate("model", "card", imported).stdout
+    signed = palpate("model", "sign", imported, "--key", key)
+    assert signed.returncode == 0, signed.stderr
+    done = palpate("model", "import", imported, "--profile", trusting)
+    assert done.returncode == 0, done.stderr
+    assert "mine:7" in palpate("model", "list").stdout
+
+
 def test_a_broken_bundle_is_not_imported(palpate: Palpate, imported: Path) -> None:
     with open(imported / "model.onnx", "ab") as model:
         model.write(b"\0")

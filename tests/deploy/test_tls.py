@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -81,6 +82,10 @@ def test_commands_join_with_certificates(station: str, certificates: Path) -> No
     variables = {"PALPATE_CONNECT": station, "PALPATE_TLS": own}
     result = CliRunner().invoke(app, ["status", "--json"], env=variables)
     assert "features" in result.output, result.output
+    result = CliRunner().invoke(app, ["fleet", *joined])
+    assert "features" in result.output, result.output
+    result = CliRunner().invoke(app, ["top", "--json", *joined, "--station", "lab"])
+    assert json.loads(result.stdout)["processes"][0]["service"] == "features", result.output
     result = CliRunner().invoke(app, ["status", "--connect", station])
     assert result.exit_code == 2
     assert "--tls FOLDER" in result.output

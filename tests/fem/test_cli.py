@@ -154,6 +154,15 @@ def test_a_study_of_paths_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) ->
     assert fem("study", "paths", "--png", "a.png").exit_code == 2
 
 
+def test_the_bench_tells_times_and_rates_of_the_solver() -> None:
+    done = fem("bench", "--json", "--edge-mm", 1.5, "--layers", 1)
+    assert done.exit_code == 0
+    told = json.loads(done.stdout)
+    assert told["solver.solve_s"] > 0.0
+    assert told["solver.factor_gflops"] > 0.0
+    assert told["memory.peak_mib"] > 0.0
+
+
 def test_a_sweep_is_resumed_and_drawn(tmp_path: Path) -> None:
     store, png = tmp_path / "a.sim", tmp_path / "a.png"
     words = ("run", "--sweep", "--points", 1, "--steps", 3, "--store", store, "--workers", 2)
@@ -337,8 +346,9 @@ def test_serve_answers_until_it_is_told_to_stop(link: LinkConfig) -> None:
             asker.start()
             asker.join(PATIENCE_S)
             assert errors[0].code.name == "UNAVAILABLE"
-        _, said = process.communicate(timeout=PATIENCE_S)
+        output, said = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0
+        assert "ready for requests" in output + said
         assert "Traceback" not in said
     finally:
         process.kill()

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner, Result
 
 from palpate.cluster import RayCluster
 from palpate.errors import ConfigError, RemoteError
 from palpate_fem.cli import model as cli_model
+from palpate_fem.cli.app import fem_app
 from palpate_fem.config import FingertipParameters
 from palpate_fem.service import ray_batch
 from palpate_fem.service.batch import BatchReport, SimulationBatch, sweep_into_store
@@ -247,6 +249,10 @@ def test_a_cluster_without_gpus_is_refused(cluster: RayCluster) -> None:
         batch_of(cluster, fakes.QUICK, "cuda")
 
 
+def fem(*words: object) -> Result:
+    return CliRunner().invoke(fem_app, [*map(str, words)], catch_exceptions=False)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -261,7 +267,7 @@ def test_a_cluster_without_gpus_is_refused(cluster: RayCluster) -> None:
 )
 def test_what_cannot_be_meant_is_refused_at_once(words: tuple[object, ...], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
-        on_host.command(*words)
+        fem("run", *words)
 
 
 def test_the_command_says_what_ran_where(
@@ -280,10 +286,10 @@ def test_the_command_says_what_ran_where(
         "--sweep", "--points", 1, "--steps", 3, "--indenter", "cube", "--friction", fakes.QUICK,
         "--workers", 1, "--store", tmp_path / "a.sim", "--ray", "head:6379",
     )  # fmt: skip
-    done = on_host.command(*words, "--device", "cpu", "--slots", 4)
+    done = fem("run", *words, "--device", "cpu", "--slots", 4)
     assert done.exit_code == 0
     said = " ".join(done.stdout.split())
     assert "5 of 5 run: 5 complete;" in said
     assert "ms a trajectory on the CPUs of the Ray cluster" in said
-    assert "5 were there already" in " ".join(on_host.command(*words).stdout.split())
+    assert "5 were there already" in " ".join(fem("run", *words).stdout.split())
     assert asked == ["head:6379"] * 2

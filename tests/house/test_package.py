@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -33,6 +34,13 @@ def _build(source: Path, target: str, out: Path) -> Path:
     )
     (built,) = out.glob("*.whl" if target == "wheel" else "*.tar.gz")
     return built
+
+
+def test_make_build_builds_it_as_the_test_does() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    recipe = re.search(r"^build:.*\n((?:\t.*\n)+)", makefile, re.MULTILINE)
+    assert recipe
+    assert recipe[1].splitlines()[-1] == "\t@$(BIN)/python -m hatchling build -d dist"
 
 
 @pytest.fixture(scope="module")

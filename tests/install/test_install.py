@@ -12,9 +12,11 @@ import pytest
 from tests.install.cases import PROFILES, VIRTUAL
 from tests.install.conftest import PROGRAM, Install
 from tests.install.image import contents, difference
+from typer.testing import CliRunner, Result
 
 from palpate.config import Role, TlsConfig
 from palpate.errors import ConfigError, LinkError, MissingExtraError
+from palpate_deploy.cli.app import app
 from palpate_deploy.install import service
 from palpate_deploy.install.ledger import InstallError
 from palpate_deploy.install.plan import InstallOrder, present_version
@@ -68,6 +70,35 @@ def test_it_writes_what_it_says_and_purge_leaves_nothing(
         before["/" + folder] = contents(root)["/" + folder]
     assert service.uninstall("lab", root, purge=True) == 0
     assert difference(before, contents(root)) == []
+
+
+def test_the_commands_show_write_and_remove_a_station(
+    root: Path, tmp_path: Path, install: Install
+) -> None:
+    profile = tmp_path / "lab.toml"
+    profile.write_text(VIRTUAL, encoding="utf-8")
+
+    def palpate(*words: str | Path) -> Result:
+        text = [*map(str, words), "--root", str(root)]
+        return CliRunner().invoke(app, text, catch_exceptions=False)
+
+    before = contents(root)
+    shown = palpate("install", profile, "--program", PROGRAM, "--dry-run")
+    assert shown.exit_code == 0, shown.output
+    assert UNIT in shown.stdout
+    assert difference(before, contents(root)) == []
+    files = tmp_path / "files"
+    done = CliRunner().invoke(app, ["install", str(profile), "--containers", str(files)])
+    assert done.exit_code == 0, done.output
+    assert (files / "compose.yaml").exists()
+    done = palpate("install", profile, "--program", PROGRAM)
+    assert done.exit_code == 0, done.output
+    assert f"wrote   /{UNIT}" in done.stdout
+    assert palpate("uninstall", "lab").exit_code == 0
+    assert not (root / UNIT).exists()
+    assert (root / PROFILE).exists()
+    assert palpate("uninstall", "lab", "--purge").exit_code == 0
+    assert not (root / PROFILE).exists()
 
 
 def test_installed_profile_means_the_same_to_root_and_to_the_service(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from palpate_training.cli import data_app, train_app
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks, write_dataset
 from palpate_training.datasets.ingest import ingest_lasa
 from palpate_training.learning.fit import FeaturesFitConfig
+from palpate_training.tasks import force_real
 from palpate_training.tasks.force_real import (
     experiment_count,
     run_force_real,
@@ -117,6 +119,20 @@ def test_published_results_meet_the_target() -> None:
         for rival in ("constant (training mean)", "linear fit"):
             assert network[MAGNITUDE] < models[rival][MAGNITUDE]
             assert network[ANGLE] < models[rival][ANGLE]
+
+
+def test_the_command_writes_page_figures_and_picture(
+    two_sensors: FeatureDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = FeaturesFitConfig(widths=(16,), epochs=1, batch_rows=1024)
+    short = partial(run_force_real, config=config, other_blocks=(), draws=50)
+    monkeypatch.setattr(force_real, "run_force_real", short)
+    write_dataset(tmp_path / "two.h5", two_sensors)
+    words = ["force-real", "--data", str(tmp_path / "two.h5"), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(train_app, [*words, "--seeds", "1"], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    for kind in ("md", "json", "png"):
+        assert (tmp_path / "out" / f"force-real.{kind}").stat().st_size > 0
 
 
 @pytest.mark.slow

@@ -336,10 +336,12 @@ def serve_command(
         f"fem serves {sensor!r} at station {station!r} through {connect}: {count} workers, "
         + (f"{config.slots} slots on {device}, " if device else "")
         + f"{waiting} may wait",
-        "`palpate status` shows when it is ready; Ctrl-C stops it",
+        "it says when it is ready; Ctrl-C stops it",
         to=console,
     )
-    node.run(config, link, station, stop)
+    node.run(
+        config, link, station, stop, on_ready=lambda: print_lines("ready for requests", to=console)
+    )
 
 
 def show_trajectory(fingertip: StoredFingertip, trajectory: IndentationResult) -> None:

@@ -358,6 +358,7 @@ def run(
     stop: threading.Event,
     *,
     instance: str = SERVICE,
+    on_ready: Callable[[], None] | None = None,
 ) -> None:
     """Serve until ``stop`` is set; then answer what is left with UNAVAILABLE, and end.
 
@@ -367,6 +368,7 @@ def run(
         station: The station to serve.
         stop: Set it to end.
         instance: Name of this process among several of its kind.
+        on_ready: Called once, when it answers and a worker waits for requests.
 
     Raises:
         ConfigError: A parameter is out of range, or there is no such device.
@@ -392,7 +394,7 @@ def run(
             health.set_state(ServiceState.STARTING, "the first fingertip is being pressurised")
             claims.wait(config.sensor, _CLAIM_S)
             try:
-                _serve(service.pool, health, presence, stop, doors)
+                _serve(service.pool, health, presence, stop, doors, on_ready)
             finally:
                 presence.not_ready()
                 health.set_state(ServiceState.STOPPING)
@@ -442,6 +444,11 @@ class _Doors(Closing):
             self.close()
         return None if holds else self._claims.refusal(self._sensor)
 
+    @property
+    def are_open(self) -> bool:
+        """Whether callers find it."""
+        return bool(self._open)
+
     def close(self) -> None:
         """Close them; what was accepted is still answered."""
         doors, self._open = self._open, []
@@ -455,6 +462,7 @@ def _serve(
     presence: Presence,
     stop: threading.Event,
     doors: _Doors,
+    on_ready: Callable[[], None] | None,
 ) -> None:
     """Show as ready while a worker is; requests that come earlier wait for one.
 
@@ -474,6 +482,9 @@ def _serve(
             continue
         if pool.ready:
             presence.ready()
+            if on_ready is not None and doors.are_open:
+                on_ready()
+                on_ready = None
             trouble = pool.trouble
             state = ServiceState.DEGRADED if trouble else ServiceState.READY
             found = state, trouble or pool.serves

@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
+from palpate_training.cli import train_app
 from palpate_training.cli.report import read_folder, train_report
 from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.container import Provenance
@@ -177,6 +179,11 @@ def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_pat
         train_report(**{**options, "splits": "sideways"})
     with pytest.raises(DatasetError, match="neither experiment"):
         read_folder(tmp_path / "out")
+    words = ["report", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--so-far"]
+    words += ["--tasks", "force", "--splits", "trajectory", "--systems", "zero, ridge", "--whole"]
+    done = CliRunner().invoke(train_app, words, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert [path.stat().st_mtime_ns for path in kept] == times
 
 
 def test_the_published_layout_goes_through_the_same_command(

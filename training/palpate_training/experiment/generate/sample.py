@@ -63,7 +63,7 @@ def make_sample(
         Ids of the trajectories of both, and the number of trials in the data set.
 
     Raises:
-        DatasetError: The folder is no finished experiment, or damaged.
+        DatasetError: The folder is no finished experiment, one of other specimens, or damaged.
     """
     mixed = read_mixed(folder / MIXED)
     wanted = _picked(mixed)
@@ -125,6 +125,11 @@ def _write_tape(
     for name in names:
         done = read_trials(folder / TRIALS, name)
         rests.update({unit: rows[0] for unit, rows in done.counts.items()})
+        if missing := [one.name for one in specimens if one.name not in done.counts]:
+            raise DatasetError(
+                f"{folder} has no trials of {', '.join(missing)}",
+                remedy="give --units the specimens of this experiment",
+            )
         counts = np.stack([done.counts[one.name] for one in specimens])
         rest_pa = fingertip.fluid_pressure_pa
         presses.append(_press(name, store.trajectory(name), counts, rest_pa))
