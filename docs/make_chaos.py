@@ -211,7 +211,8 @@ def draw(found: dict[str, Any]) -> None:
     share.fill_between(minutes, 100.0 * (1.0 - gone), step="mid", color="#5b8e7d", lw=0)
     share.set_ylabel("% of each second\nnot in a gap over 0.1 s")
     share.set_ylim(0, 100)
-    share.set_title("estimates at most 30 ms old at the robot, and what was broken meanwhile", loc="left")
+    title = "estimates at most 30 ms old at the robot, and what was broken meanwhile"
+    share.set_title(title, loc="left")
     for one in found["events"]:
         row = names.index(one["fault"])
         end_s = one["at_s"] + one["lasted_s"] + (one["well_s"] or 90.0)
