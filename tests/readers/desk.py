@@ -7,11 +7,12 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from tests.readers.page import Block, blocks_of, missing_lines
 from tests.readers.terminal import Terminal, Unexpected, plain
+
+from palpate.process import Closing
 
 CHECKOUT = "<this repository>"
 """Where a page says to clone from."""
@@ -19,7 +20,7 @@ LIMIT_S = 1200.0
 """For one command, on a host with other work."""
 
 
-class Desk:
+class Desk(Closing):
     """The terminals of a reader, and what was done in them.
 
     Attributes:
@@ -57,15 +58,8 @@ class Desk:
         self.printed: dict[str, str] = {}
         self.steps: list[dict[str, Any]] = []
 
-    def __enter__(self) -> Desk:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Close all terminals, and end what runs in them."""
         self._stack.close()
 
     def follow(self, path: Path, *, again: bool = False) -> list[str]:
