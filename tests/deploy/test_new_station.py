@@ -362,6 +362,9 @@ def answered(*answers: bytes) -> tuple[str, int | None]:
         # A question ends in ": " and waits.
         if left and said[answered_to:].endswith(b": "):
             answer = left.pop(0)
+            if answer == b"\x03":
+                # Python loses a signal between the prompt and its first look at the keyboard.
+                time.sleep(0.5)
             if answer == b"0\n":
                 numbers = [line.split()[0] for line in said.splitlines() if line[:2] == b"  "]
                 answer = numbers[-1] + b"\n"

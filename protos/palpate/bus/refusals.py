@@ -52,7 +52,6 @@ _DROPPED = b" zenoh::net::routing::interceptor: Msg intercepted"
 _SENDER = re.compile(rb" src=\S*/([0-9a-f]+):")
 
 _READ_BYTES = 1 << 18
-_FEW_BYTES = 1 << 14
 _LOOK_S = 0.05
 _CLOSE_S = 5.0
 
@@ -171,8 +170,6 @@ class RefusalLog(Closing):
                 return
             *whole, rest = (rest + got).split(b"\n")
             yield whole
-            if len(got) < _FEW_BYTES:
-                self._closed.wait(_LOOK_S)
 
     def close(self) -> None:
         """Give standard output back."""
