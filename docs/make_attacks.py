@@ -36,8 +36,8 @@ virtual finger and one robot's poses, on one host; the attackers are Zenoh sessi
 files. [security.md](../security.md) says what each stands for.
 
 *Refused*: the attack had no effect, and the station went on with the same processes. *Logged*: the
-first words of the line in the log of a process, or the counter. Who `refused: a message of` names,
-a line of the router's log says: address, role, id.
+first words of the line in the log of a process, or the counter. `refused: a message of` names an
+id; the router's log tells its address and role.
 
 | attack | refused | the attacker is told | logged |
 |---|---|---|---|

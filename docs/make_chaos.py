@@ -56,17 +56,14 @@ Mended:
 * In the namespaces of `make debian`, credentials did not reach a unit, because mounts were not
   shared as container managers share them. Now they do: `LoadCredential` by role is what all
   processes of this run live by.
-
-Mended after the run on this page, whose times have it still:
-
 * A gateway that was started again while the finger was touched took no tare until it was let go,
   and without a tare there is no estimate. It goes on with its last tare now
   ([tare and health](../tare-and-health.md)).
 
 Not mended:
 
-* Three zombies called `palpate` are seen at the end. Nobody knows whose children they are: the
-  station's, or those of the programs that break things.
+* Zombies called `palpate`, three or four, are seen at the end. Nobody knows whose children they
+  are: the station's, or those of the programs that break things.
 * A full disk is told in the status and counted, and of four times one is not in the log.
 * A process that hangs is gone for others after the lease of a link, which is 2 s by default; the
   reference measured with 1 s. On a busy host a shorter one takes links down that are well.

@@ -152,10 +152,7 @@ class Lab(Closing):
             lines = self.log(service)[since:].splitlines()
             return next((line for line in lines if words in line), "")
 
-        deadline = time.monotonic() + 10.0
-        while not (line := find()) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        return line
+        return _soon(find)
 
     def lengths(self) -> dict[str, int]:
         """How long the log of each process is now [characters]."""
@@ -166,22 +163,17 @@ class Lab(Closing):
 
         Who it is, the router's log says: somebody with the certificate of that role.
         """
-        line = ""
 
-        def find() -> bool:
-            nonlocal line
-            for service in since:
-                for line in self.log(service)[since[service] :].splitlines():
+        def find() -> str:
+            joined = self.log("router")
+            for service, length in since.items():
+                for line in self.log(service)[length:].splitlines():
                     found = re.search(r"refused: a message of ([0-9a-f]+):", line)
-                    if found and f"joins: {role} (id {found[1]}" in self.log("router"):
-                        return True
-            line = ""
-            return False
+                    if found and f"joins: {role} (id {found[1]}" in joined:
+                        return line
+            return ""
 
-        deadline = time.monotonic() + 10.0
-        while not find() and time.monotonic() < deadline:
-            time.sleep(0.1)
-        return line
+        return _soon(find)
 
     def processes(self) -> dict[str, int]:
         """Process ids of the station's processes by service."""
@@ -238,6 +230,14 @@ class Lab(Closing):
             except subprocess.TimeoutExpired:
                 self._up.kill()
                 self._up.wait()
+
+
+def _soon(find: Callable[[], str]) -> str:
+    """What is found in a log as soon as it is there; empty if it does not come."""
+    deadline = time.monotonic() + 10.0
+    while not (line := find()) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    return line
 
 
 class Heard(Closing):

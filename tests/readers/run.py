@@ -66,7 +66,8 @@ def follow(reader: Reader, dist: Path, work: Path) -> dict[str, Any]:
     }  # fmt: skip
     if lacks:
         return {**found, "skipped": lacks}
-    source = f"source {work.parent / reader.after}/work/env/bin/activate" if reader.after else ""
+    before = work.parent / reader.after / folder.name / "env"
+    source = f"source {before / 'bin' / 'activate'}" if reader.after else ""
     with (
         Network() as network,
         Desk(
