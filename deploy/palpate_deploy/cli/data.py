@@ -134,6 +134,13 @@ def data_generate(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of points, registration and noise.")] = 0,
+    registration_seed: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Of the registration alone: more presses by the robots of another experiment.",
+        ),
+    ] = None,
     indenter: IndenterOption = None,
     units: UnitsOption = None,
     units_each: Annotated[
@@ -211,6 +218,7 @@ def data_generate(
         presses=random or 0,
         units_each=units_each,
         seed=seed,
+        registration_seed=registration_seed,
         edge_m=edge_mm * 1e-3,
         fluid_volume_m3=fill_m3,
         indenters=tuple(make_indenter(name).name for name in indenter or ()),

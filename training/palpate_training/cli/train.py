@@ -43,7 +43,15 @@ GainSpread = Annotated[
     ),
 ]
 
+Device = Annotated[
+    str, typer.Option(help="Where it is trained: cpu, cuda, or auto = on a GPU if there is one.")
+]
+BatchRows = Annotated[
+    int, typer.Option(min=1, help="Rows in one step; more for more rows, and on a GPU.")
+]
+
 EPOCHS = 80
+BATCH_ROWS = 256
 GAIN_SPREAD = 0.1
 """The defaults of ``MembersConfig``, whose module needs torch."""
 
@@ -62,6 +70,8 @@ def train_field(
     epochs: Epochs = EPOCHS,
     gain_spread: GainSpread = GAIN_SPREAD,
     serials: Serials = None,
+    device: Device = "auto",
+    batch_rows: BatchRows = BATCH_ROWS,
 ) -> None:
     """Electrodes -> displacement of the whole skin: train, test on unseen trajectories, write.
 
@@ -76,6 +86,8 @@ def train_field(
         data,
         out,
         epochs,
+        batch_rows,
+        device=device,
         gain_spread=gain_spread,
         units=chosen,
         name=name,
@@ -94,6 +106,8 @@ def train_synthesis(
     version: Version = 1,
     seed: Seed = 0,
     epochs: Epochs = EPOCHS,
+    device: Device = "auto",
+    batch_rows: BatchRows = BATCH_ROWS,
 ) -> None:
     """Displacement of the skin -> electrodes of one unit: train, test on unseen, write.
 
@@ -102,8 +116,8 @@ def train_synthesis(
     from palpate_training.tasks.synthesis import synthesis_bundle
 
     metrics = _bundle(
-        synthesis_bundle, "synthesis", data, out, epochs,
-        unit=unit, name=name, version=version, seed=seed,
+        synthesis_bundle, "synthesis", data, out, epochs, batch_rows,
+        device=device, unit=unit, name=name, version=version, seed=seed,
     )  # fmt: skip
     _show(metrics, f"{name} {version}, {unit}: unseen trajectories", out)
 
@@ -127,6 +141,8 @@ def train_all(
         typer.Option(min=0, max=4095, help="Rest [counts] of trials whose file has none."),
     ] = None,
     serials: Serials = None,
+    device: Device = "auto",
+    batch_rows: BatchRows = BATCH_ROWS,
 ) -> None:
     """Bundles of all tasks from one data set: features, field, synthesis, and their model cards.
 
@@ -159,6 +175,8 @@ def train_all(
             epochs,
             gain_spread,
             serials,
+            device,
+            batch_rows,
         )
     if isinstance(experiment, MixedDataset):
         chosen = unit or experiment.experiment.unit_names[0]
@@ -172,9 +190,21 @@ def train_all(
             epochs,
             gain_spread,
             serials,
+            device,
+            batch_rows,
         )
         synthesis = f"synthesis-{name}"
-        train_synthesis(data, folders["synthesis"], chosen, synthesis, version, seed, epochs)
+        train_synthesis(
+            data,
+            folders["synthesis"],
+            chosen,
+            synthesis,
+            version,
+            seed,
+            epochs,
+            device,
+            batch_rows,
+        )
     else:
         console.print("no field and no synthesis: the data set has no displacements")
     cards = [read_bundle(folder) for folder in folders.values()]
@@ -286,6 +316,8 @@ def train_features_command(
     epochs: Epochs = EPOCHS,
     gain_spread: GainSpread = GAIN_SPREAD,
     serials: Serials = None,
+    device: Device = "auto",
+    batch_rows: BatchRows = BATCH_ROWS,
 ) -> None:
     """Train force and contact location, test on unseen presses, write the bundle.
 
@@ -307,9 +339,12 @@ def train_features_command(
             out,
             name=name,
             version=version,
-            config=replace(FEATURES_CONFIG, epochs=epochs, gain_spread=gain_spread),
+            config=replace(
+                FEATURES_CONFIG, epochs=epochs, gain_spread=gain_spread, batch_rows=batch_rows
+            ),
             seed=seed,
             serials=serials or (),
+            device=device,
             on_epoch=on_epoch,
         )
         _finish(progress)
@@ -323,7 +358,7 @@ def train_population_command(
     out: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="For population.npz, .json and .onnx.")
     ],
-    device: Annotated[str, typer.Option(help="Where it is trained: auto, cpu or cuda.")] = "auto",
+    device: Device = "auto",
     seed: Seed = 0,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the rows at most.")] = 60,
     batch_rows: Annotated[int, typer.Option(min=1, help="Rows in one step.")] = 4096,
@@ -449,6 +484,7 @@ def _bundle(
     data: Path,
     out: Path,
     epochs: int,
+    batch_rows: int,
     *,
     gain_spread: float = GAIN_SPREAD,
     **options: Any,
@@ -458,7 +494,7 @@ def _bundle(
     from palpate_training.tasks.fields import FieldFitConfig
 
     with _progress() as progress:
-        config = FieldFitConfig(epochs=epochs, gain_spread=gain_spread)
+        config = FieldFitConfig(epochs=epochs, gain_spread=gain_spread, batch_rows=batch_rows)
         bar = progress.add_task(task, total=epochs * config.members)
         return train(
             read_mixed(data), out, config=config, on_epoch=lambda: progress.advance(bar), **options

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from palpate_training.learning.electrode_nets import MIRROR_AXES, ElectrodeNet, MembersConfig
 from palpate_training.learning.fit import OnEpoch, fit
-from palpate_training.learning.networks import Standardised, predict
+from palpate_training.learning.networks import Standardised, device_of, predict
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -92,7 +92,7 @@ def fit_features_net(
             for member in range(len(begun), config.members)
         ),
     ]
-    return FeaturesNet(members, rest, symmetric=symmetric).eval()
+    return FeaturesNet(members, rest, symmetric=symmetric).to(device_of(members[0])).eval()
 
 
 def _fit_member(
@@ -114,6 +114,7 @@ def _fit_member(
         inputs = np.vstack([inputs, inputs[:, net.inputs.order.numpy()]])
         targets = np.vstack([targets, targets * np.tile(MIRROR_AXES, quantities)])
     _normalise(member, inputs, targets)
+    net.to(torch.get_default_device())
     fit(
         member,
         inputs,

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from palpate.errors import ConfigError
 from palpate_training.datasets.features import ELECTRODES
 
 PAPER_WIDTHS = (256, 128, 128)
@@ -104,6 +105,19 @@ def predict(
             for part in torch.split(torch.from_numpy(inputs), batch_rows)
         ]
     return np.concatenate(parts)
+
+
+def training_device(wanted: str) -> str:
+    """Where networks are trained: ``cpu``, ``cuda``, or for ``auto`` a GPU if there is one.
+
+    Raises:
+        ConfigError: It is none of these, or there is no GPU.
+    """
+    if wanted not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"no device {wanted!r}", remedy="choose auto, cpu or cuda")
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("torch sees no GPU", remedy="give --device cpu, or auto")
+    return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def device_of(net: nn.Module) -> torch.device:

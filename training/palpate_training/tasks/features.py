@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from palpate.errors import DatasetError
 from palpate.files.intervals import Intervals
@@ -47,7 +48,7 @@ from palpate_training.learning.metrics import (
     location_metrics,
     rms,
 )
-from palpate_training.learning.networks import predict, round_to_half
+from palpate_training.learning.networks import predict, round_to_half, training_device
 from palpate_training.learning.ranges import ends_of, known_inputs, places_of
 from palpate_training.learning.splits import Rows, RowSplit, by_group
 
@@ -92,18 +93,21 @@ def train_features(
     config: FeaturesNetConfig = FEATURES_CONFIG,
     seed: int = 0,
     serials: Sequence[str] = (),
+    device: str = "cpu",
     on_epoch: OnEpoch | None = None,
 ) -> FeaturesReport:
     """Train, evaluate on presses that were never seen, and write the bundle.
 
     The seed decides the split, the weights and the order of rows; ``serials`` are those of the
-    manifest.
+    manifest, ``device`` is where it is trained: cpu, cuda, or auto = on a GPU if there is one.
 
     Raises:
+        ConfigError: There is no GPU, but one is wanted.
         DatasetError: The data set breaks its schema or has too few presses.
         BundleError: The folder exists, or parity fails; nothing is left on disk.
     """
     refuse_existing(bundle_dir)
+    where = training_device(device)
     data = open_dataset(dataset_path)
     split = by_group(data.group, seed=seed)
     x = data.tared_counts
@@ -141,13 +145,15 @@ def train_features(
             on_epoch=tick,
         )
 
-    # A finger may be too uneven for its mirror image to teach anything.
-    plain = fit("features", 1, None, symmetric=False)
-    mirrored = fit("features, mirror images", 1, None, symmetric=True)
-    best = min((plain, mirrored), key=lambda one: score_of(one, validation))
-    net = best
-    if config.members > 1:
-        net = fit("features, other members", config.members, best, symmetric=best.symmetric)
+    with torch.device(where):
+        # A finger may be too uneven for its mirror image to teach anything.
+        plain = fit("features", 1, None, symmetric=False)
+        mirrored = fit("features, mirror images", 1, None, symmetric=True)
+        best = min((plain, mirrored), key=lambda one: score_of(one, validation))
+        net = best
+        if config.members > 1:
+            net = fit("features, other members", config.members, best, symmetric=best.symmetric)
+    net.cpu()
     round_to_half(net)
 
     validated, tested = (predict(net, x[rows]) for rows in (split.validation, split.test))

@@ -55,6 +55,7 @@ from palpate_training.learning.networks import (
     device_of,
     predict,
     round_to_half,
+    training_device,
 )
 from palpate_training.learning.ranges import ends_of, known_inputs, longest_of
 from palpate_training.learning.splits import Rows, RowSplit, by_trajectory, of_units, unit_sets
@@ -317,21 +318,26 @@ def field_bundle(
     config: FieldFitConfig | None = None,
     seed: int = 0,
     serials: Sequence[str] = (),
+    device: str = "cpu",
     on_epoch: OnEpoch | None = None,
 ) -> dict[str, float]:
     """Electrodes -> field of some units, empty = all, as a bundle; returns its held-out metrics.
 
-    ``serials`` are those of the manifest.
+    ``serials`` are those of the manifest, ``device`` is where it is trained: cpu, cuda, or auto =
+    on a GPU if there is one.
 
     Raises:
+        ConfigError: There is no GPU, but one is wanted.
         DatasetError: A unit is not known, or too few trajectories are left.
         BundleError: The folder exists, or parity fails; nothing is left on disk.
     """
     refuse_existing(folder)
+    where = training_device(device)
     units = units or unit_sets(data.experiment)[-1]
     split = of_units(data.experiment, by_trajectory(data.experiment, seed=seed), units)
-    model = fit_field(data, split, config=config, seed=seed, on_epoch=on_epoch)
-    round_to_half(model.net)
+    with torch.device(where):
+        model = fit_field(data, split, config=config, seed=seed, on_epoch=on_epoch)
+    round_to_half(model.net.cpu())
     code, counts = model.code, tared_counts(data)
     force_n = np.linalg.norm(data.experiment.force[split.test].astype(np.float64), axis=1)
 

@@ -25,7 +25,7 @@ import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from palpate.errors import BundleError, ConfigError, DatasetError
+from palpate.errors import BundleError, DatasetError
 from palpate.files.atomic import written_whole
 from palpate_training.datasets.features import (
     OF_CONTACT,
@@ -33,6 +33,7 @@ from palpate_training.datasets.features import (
     open_dataset,
 )
 from palpate_training.learning import baselines
+from palpate_training.learning.networks import training_device
 from palpate_training.learning.population_fit import (
     TOUCHED_N,
     PopulationRows,
@@ -224,7 +225,7 @@ def train_population(
         ConfigError: There is no GPU, but one is wanted.
         DatasetError: The data breaks its schema, is no population, or the disk refused.
     """
-    where = _device(device)
+    where = training_device(device)
     data = open_dataset(path)
     quantities, rows = rows_of(data)
     targets = rows.targets
@@ -286,14 +287,6 @@ def stop_rows(rows: PopulationRows, chosen: Mask, *, seed: int) -> list[StopRows
         )
         for draw in drawn
     ]
-
-
-def _device(wanted: str) -> str:
-    if wanted not in ("auto", "cpu", "cuda"):
-        raise ConfigError(f"no device {wanted!r}", remedy="choose auto, cpu or cuda")
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("torch sees no GPU", remedy="give --device cpu, or auto")
-    return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def rows_of(data: FeatureDataset) -> tuple[tuple[str, ...], PopulationRows]:

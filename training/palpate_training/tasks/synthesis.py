@@ -37,7 +37,12 @@ from palpate_training.learning.metrics import (
     rms,
     root_mean,
 )
-from palpate_training.learning.networks import device_of, predict, round_to_half
+from palpate_training.learning.networks import (
+    device_of,
+    predict,
+    round_to_half,
+    training_device,
+)
 from palpate_training.learning.ranges import ends_of, longest_of
 from palpate_training.learning.splits import Rows, RowSplit, by_trajectory, of_units
 from palpate_training.tasks.fields import (
@@ -153,13 +158,16 @@ def synthesis_bundle(
     version: int = 1,
     config: FieldFitConfig | None = None,
     seed: int = 0,
+    device: str = "cpu",
     on_epoch: OnEpoch | None = None,
 ) -> dict[str, float]:
     """Field -> electrodes of one unit, as a bundle; the arguments are those of ``field_bundle``."""
     refuse_existing(folder)
+    where = training_device(device)
     split = of_units(data.experiment, by_trajectory(data.experiment, seed=seed), [unit])
-    model = fit_synthesis(data, split, config=config, seed=seed, on_epoch=on_epoch)
-    round_to_half(model.net)
+    with torch.device(where):
+        model = fit_synthesis(data, split, config=config, seed=seed, on_epoch=on_epoch)
+    round_to_half(model.net.cpu())
     counts = tared_counts(data)
     features = synthesis_features(data, model.code, model.pooling)
     test, validation = split.test, split.validation

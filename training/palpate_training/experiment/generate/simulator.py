@@ -61,6 +61,8 @@ class ExperimentSpec:
         skin_thickness_m: Of the unpressurised skin [m]; None = the simulator's own, as below.
         shear_modulus_pa: Of the skin [Pa].
         friction_coefficient: Between indenter and skin.
+        registration_seed: Of the robots' registration; None = ``seed``. Experiments of the same
+            specimens with the same one are by robots that stand equally wrong.
     """
 
     points: int = 10
@@ -76,11 +78,17 @@ class ExperimentSpec:
     skin_thickness_m: float | None = None
     shear_modulus_pa: float | None = None
     friction_coefficient: float | None = None
+    registration_seed: int | None = None
 
     def content(self) -> dict[str, Any]:
         """As plain values; those that came later only where they are used."""
         values = asdict(self)
-        later = {"paths": (), "presses": 0, "units_each": 0, **dict.fromkeys(SKIN)}
+        later = {
+            "paths": (),
+            "presses": 0,
+            "units_each": 0,
+            **dict.fromkeys((*SKIN, "registration_seed")),
+        }
         return {
             key: value for key, value in values.items() if key not in later or value != later[key]
         }

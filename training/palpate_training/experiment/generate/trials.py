@@ -357,7 +357,8 @@ def _tasks(
     *,
     in_worker: bool,
 ) -> Iterator[TrialTask]:
-    errors, fingertip = registration_errors(specimens, spec.seed), store.fingertip()
+    seed = spec.seed if spec.registration_seed is None else spec.registration_seed
+    errors, fingertip = registration_errors(specimens, seed), store.fingertip()
     for plan in plans:
         who = [i for i, one in enumerate(specimens) if one.pressed_with(plan.indenter)]
         if 0 < spec.units_each < len(who):
