@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -278,6 +279,16 @@ def test_presses_at_random_are_executed_on_some_of_the_specimens(tmp_path: Path)
     np.testing.assert_array_equal(again.data.experiment.tared, data.tared)
     every = replace(spec, units_each=0)
     assert provenance_sha256(every, four, "") != provenance_sha256(spec, four, "")
+    # The same presses by robots that stand as they did in another experiment.
+    elsewhere = replace(spec, registration_seed=9)
+    assert "registration_seed" not in spec.content()
+    assert provenance_sha256(elsewhere, four, "") != provenance_sha256(spec, four, "")
+    shutil.copytree(tmp_path / "random" / STORE, tmp_path / "moved" / STORE)
+    moved = generate(tmp_path / "moved", elsewhere, four, FemSimulator(), workers=1)
+    assert moved is not None
+    assert moved.data.experiment.trajectories == data.trajectories
+    apart_m = np.linalg.norm(moved.data.experiment.location[0] - data.location[0])
+    assert 1e-5 < apart_m < 3e-3
 
 
 def test_the_command_takes_points_a_seed_and_specimens(tmp_path: Path) -> None:

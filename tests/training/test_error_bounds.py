@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import read_bundle
 from palpate.files.training_range import KnownInputs
 from palpate_training.datasets.features import FeatureDataset, write_dataset
+from palpate_training.learning import intervals
 from palpate_training.learning.features_net import FeaturesNetConfig
 from palpate_training.learning.intervals import (
     EVERY_TERM,
@@ -54,6 +57,22 @@ def test_bounds_hold_on_presses_that_were_not_seen() -> None:
         new_errors, new_terms, new_press = _presses(1000 + seed, 400)
         share.append(covered(new_errors, bounds(formula, new_terms), new_press))
     assert 0.89 < np.mean(share) < 0.95
+
+
+def test_of_many_presses_some_rows_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors, terms, press = _presses(8, 300)
+    seen: list[int] = []
+
+    def counted(cost: Floats, **given: Any) -> Any:
+        seen.append(len(given["b_eq"]))
+        return linprog(cost, **given)
+
+    monkeypatch.setattr(intervals, "linprog", counted)
+    monkeypatch.setattr(intervals, "ROWS_MOST", 900)
+    formula = fit_formula("force", errors, terms, press)
+    assert max(seen) == 900  # three rows of each press
+    new_errors, new_terms, new_press = _presses(1008, 400)
+    assert 0.87 < covered(new_errors, bounds(formula, new_terms), new_press) < 0.93
 
 
 def test_bounds_follow_the_errors() -> None:

@@ -4,6 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from palpate_training.learning.features_net import (
+    FeaturesNetConfig,
+    FeaturesRows,
+    fit_features_net,
+    score_of,
+)
 from palpate_training.learning.fit import FeaturesFitConfig, fit_quantity
 from palpate_training.learning.networks import predict
 
@@ -42,3 +48,16 @@ def test_a_recorded_step_is_the_step_itself(
     monkeypatch.setattr("palpate_training.learning.fit.recorded", lambda step, batch_rows: step)
     one_by_one = trained(rows, "cuda", epochs=5)
     np.testing.assert_allclose(recorded, one_by_one, atol=1e-3 * np.abs(one_by_one).max())
+
+
+def test_the_network_that_ships_learns_as_on_the_cpu(rows: tuple[np.ndarray, np.ndarray]) -> None:
+    known = FeaturesRows(*rows)
+    config = FeaturesNetConfig(epochs=20, members=2, batch_rows=128)
+    scores = {}
+    for device in ("cpu", "cuda"):
+        with torch.device(device):
+            net = fit_features_net(
+                known, known, np.full(19, 3000, np.float32), symmetric=True, config=config
+            )
+        scores[device] = score_of(net.cpu(), known)
+    assert scores["cuda"] == pytest.approx(scores["cpu"], rel=0.2)

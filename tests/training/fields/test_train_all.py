@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+import torch
 from typer.testing import CliRunner
 
-from palpate.errors import BundleError
+from palpate.errors import BundleError, ConfigError
 from palpate.files.bundle import read_bundle
 from palpate_training.cli import train_app
 from palpate_training.datasets.experiment import MixedDataset, write_mixed
-from palpate_training.datasets.export import export_published
+from palpate_training.datasets.export import export_published, features
+from palpate_training.datasets.features import write_dataset
 
 
 def test_one_command_trains_all_bundles_and_writes_their_cards(
@@ -47,3 +50,22 @@ def test_published_files_have_features_alone_and_it_says_so(
     assert [each.name for each in (tmp_path / "models").iterdir() if each.is_dir()] == [
         "features-twin"
     ]
+
+
+@pytest.mark.parametrize("task", ["features", "field", "synthesis"])
+def test_a_gpu_that_is_not_there_is_told_before_a_training(
+    mixed: MixedDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: str
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    data, out = tmp_path / "data.h5", tmp_path / "bundle"
+    if task == "features":
+        write_dataset(data, features(mixed))
+        arguments = [task, "--data", str(data), "--out", str(out)]
+    else:
+        write_mixed(data, mixed)
+        arguments = [task, str(data), str(out)]
+    arguments += ["--unit", "biotac-2"] if task == "synthesis" else []
+    result = CliRunner().invoke(train_app, [*arguments, "--device", "cuda", "--epochs", "1"])
+    assert isinstance(result.exception, ConfigError)
+    assert "no GPU" in str(result.exception)
+    assert not out.exists()
