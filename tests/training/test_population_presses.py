@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from tests.training.invented_population import SMALL, population
+from typer.testing import CliRunner
 
 from palpate.errors import DatasetError
+from palpate_training.cli import train_app
 from palpate_training.datasets.features import FeatureDataset, write_dataset
 from palpate_training.learning import population_fit
 from palpate_training.learning.networks import predict
@@ -23,7 +26,13 @@ from palpate_training.learning.population_net import (
     load_population_net,
 )
 from palpate_training.learning.press_set import CalibrationPresses
-from palpate_training.tasks.population import REPORT, rows_of, train_population
+from palpate_training.tasks.population import (
+    REPORT,
+    fingertips_of,
+    rows_of,
+    train_population,
+)
+from palpate_training.tasks.population_bounds import held_bounds
 from palpate_training.tasks.population_errors import SHOTS, draw_shots, shots_table
 
 UNSEEN = "unseen_specimen_unseen_press"
@@ -46,6 +55,48 @@ def folder(data: FeatureDataset, tmp_path_factory: pytest.TempPathFactory) -> Pa
     config = replace(SMALL, epochs=40, batch_rows=512)
     train_population(out / "features.h5", out, config=config, device="cpu")
     return out
+
+
+def test_bounds_hold_on_specimens_that_neither_network_nor_bound_has_met(
+    folder: Path, data: FeatureDataset, rows: PopulationRows, net: PopulationNet
+) -> None:
+    tested = np.flatnonzero(rows.touched)
+    estimate = predict(net, rows.inputs)[tested]
+    found = held_bounds(net.quantities, estimate, rows, tested, fingertips_of(data))
+    assert set(found) == {"force_magnitude", "contact_location"}
+    for one in found.values():
+        assert one["specimens"] == 24
+        assert one["worst"] < one["held"]
+        assert one["ci95"][0] <= one["held"] <= one["ci95"][1]
+        assert one["error"] < one["bound"]
+        assert 0.8 < one["held"] < 0.99
+    # Half of them ten times as badly estimated, of which the others' bounds know nothing.
+    worse = estimate.copy()
+    badly = rows.specimen[tested] >= 12
+    worse[badly] += 9.0 * (worse[badly] - rows.targets[tested][badly])
+    assert (
+        held_bounds(net.quantities, worse, rows, tested, rows.specimen)["force_magnitude"]["worst"]
+        < 0.5
+    )
+    one = tested[rows.specimen[tested] == 3]
+    assert (
+        held_bounds(net.quantities, predict(net, rows.inputs)[one], rows, one, rows.specimen) == {}
+    )
+
+
+def test_a_network_is_measured_again_without_a_training(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "again")
+    weights = (folder / WEIGHTS).read_bytes()
+    arguments = ["population", str(folder / "features.h5"), str(tmp_path / "again"), "--measure"]
+    result = CliRunner().invoke(train_app, arguments, env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    assert "bound of force_magnitude holds" in result.output
+    assert (tmp_path / "again" / WEIGHTS).read_bytes() == weights
+    before, after = (json.loads((one / REPORT).read_text()) for one in (folder, tmp_path / "again"))
+    before["onnx"].pop("milliseconds"), after["onnx"].pop("milliseconds")
+    assert after == before
+    (tmp_path / "again" / WEIGHTS).unlink()
+    assert isinstance(CliRunner().invoke(train_app, arguments).exception, DatasetError)
 
 
 @pytest.fixture
@@ -177,9 +228,9 @@ def test_a_set_with_few_presses_has_a_table_as_far_as_they_go(
     rows: PopulationRows, net: PopulationNet
 ) -> None:
     few = np.isin(rows.press, np.unique(rows.press)[:9])
-    table = shots_table(rows, few, net, seed=0)
+    table = shots_table(rows, few, net, rows.specimen, seed=0)
     assert {int(key) for key in table if key.isdigit()} == {0, 1, 5} < set(SHOTS)
-    assert shots_table(rows, rows.press == 5, net, seed=0) == {}
+    assert shots_table(rows, rows.press == 5, net, rows.specimen, seed=0) == {}
 
 
 def test_turns_are_rotations() -> None:

@@ -379,6 +379,9 @@ def train_population_command(
             help="Random factor of a specimen's forces in training, which its presses tell [log].",
         ),
     ] = 0.3,
+    measure: Annotated[
+        bool, typer.Option("--measure", help="Measure the network in FOLDER again; do not train.")
+    ] = False,
 ) -> None:
     """One network for a population, told a specimen by presses of it.
 
@@ -394,9 +397,9 @@ def train_population_command(
         common=common, common_sd=common_sd, gain_sd=gain_spread, stiffness_sd=stiffness_sd,
     )  # fmt: skip
     with _progress() as progress:
-        bar = progress.add_task("population", total=epochs)
+        bar = progress.add_task("measured" if measure else "population", total=epochs)
         _, facts = train_population(
-            data, out, config=config, device=device, seed=seed,
+            data, out, config=config, device=device, seed=seed, measure=measure,
             on_epoch=lambda: progress.advance(bar),
         )  # fmt: skip
     for name, cell in facts["cells"].items():
@@ -411,6 +414,9 @@ def train_population_command(
             for key in shots["0"]:
                 if key != "ci95":
                     table.add_row(key, *(f"{one[key]:.3f}" for one in shots.values()))
+            for name in cell["shots"]["0"]["bounds"]:
+                held = (cell["shots"][key]["bounds"][name]["held"] for key in shots)
+                table.add_row(f"bound of {name} holds", *(f"{100 * one:.1f} %" for one in held))
             console.print(table)
     console.print(f"wrote {out}")
 

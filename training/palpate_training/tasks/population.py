@@ -47,6 +47,7 @@ from palpate_training.learning.population_net import (
     PopulationConfig,
     PopulationNet,
     inputs_of,
+    load_population_net,
     save_population_net,
 )
 from palpate_training.tasks.population_errors import Estimate, cell, draw_shots, shots_table
@@ -206,6 +207,7 @@ def train_population(
     config: PopulationConfig,
     device: str = "auto",
     seed: int = 0,
+    measure: bool = False,
     on_epoch: Callable[[], None] | None = None,
 ) -> tuple[PopulationNet, dict[str, Any]]:
     """Train, measure, and write weights and report into a folder.
@@ -216,6 +218,7 @@ def train_population(
         config: Settings.
         device: Where it is trained: cpu, cuda, or auto = on a GPU if there is one.
         seed: Of split, weights, order of the rows and noise.
+        measure: Whether the network that the folder holds is measured again, not trained.
         on_epoch: Called after each epoch, for a progress bar.
 
     Returns:
@@ -230,25 +233,34 @@ def train_population(
     quantities, rows = rows_of(data)
     targets = rows.targets
     split = split_population(data, seed=seed)
-    begun = time.monotonic()
-    with torch.device(where):
-        if where == "cuda":
-            torch.set_float32_matmul_precision("high")
-        net = fit_population(
-            rows.where(split.train),
-            [stop_rows(rows, chosen, seed=seed) for chosen in split.validation],
-            quantities,
-            config=config,
-            seed=seed,
-            on_epoch=on_epoch,
-        )
-    trained_s = time.monotonic() - begun
-    save_population_net(out / WEIGHTS, net)
+    if measure:
+        net, trained = load_population_net(out / WEIGHTS), _trained_before(out / REPORT)
+    else:
+        begun = time.monotonic()
+        with torch.device(where):
+            if where == "cuda":
+                torch.set_float32_matmul_precision("high")
+            net = fit_population(
+                rows.where(split.train),
+                [stop_rows(rows, chosen, seed=seed) for chosen in split.validation],
+                quantities,
+                config=config,
+                seed=seed,
+                on_epoch=on_epoch,
+            )
+        trained = {
+            "config": asdict(config),
+            "device": where,
+            "trained_s": round(time.monotonic() - begun, 1),
+        }
+        save_population_net(out / WEIGHTS, net)
     rivals = _rivals(net, rows.inputs, targets, split)
     cells = {name: cell(rows, chosen, net, rivals) for name, chosen in split.cells.items()}
     for name, of_cell in cells.items():
         if name != "seen_specimen_seen_press":
-            of_cell["shots"] = shots_table(rows, split.cells[name], net, seed=seed)
+            of_cell["shots"] = shots_table(
+                rows, split.cells[name], net, fingertips_of(data), seed=seed
+            )
     facts: dict[str, Any] = {
         "data": data.provenance.source,
         "data_sha256": data.content_sha256(),
@@ -259,16 +271,22 @@ def train_population(
         "specimens": len(data.sensor_names),
         "unseen_specimens": split.specimens,
         "quantities": quantities,
-        "config": asdict(config),
         "seed": seed,
-        "device": where,
-        "trained_s": round(trained_s, 1),
+        **trained,
         "cells": cells,
     }
     facts["onnx"] = _export(out / ONNX, net, data, split.cells["unseen_specimen_unseen_press"])
     with written_whole(out / REPORT) as part:
         part.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     return net, facts
+
+
+def _trained_before(report: Path) -> dict[str, Any]:
+    """How the network was trained, by the report beside it; nothing where there is none."""
+    if not report.exists():
+        return {}
+    known = json.loads(report.read_text(encoding="utf-8"))
+    return {key: known[key] for key in ("config", "device", "trained_s") if key in known}
 
 
 def stop_rows(rows: PopulationRows, chosen: Mask, *, seed: int) -> list[StopRows]:

@@ -26,6 +26,7 @@ from palpate_training.learning.metrics import (
 from palpate_training.learning.networks import predict
 from palpate_training.learning.population_fit import PopulationRows
 from palpate_training.learning.population_net import PopulationNet
+from palpate_training.tasks.population_bounds import held_bounds
 
 FloatArray = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -124,13 +125,20 @@ def cell(
 
 
 def shots_table(
-    rows: PopulationRows, chosen: Mask, net: PopulationNet, *, seed: int
+    rows: PopulationRows, chosen: Mask, net: PopulationNet, fingertip: Rows, *, seed: int
 ) -> dict[str, Any]:
     """Errors by number of known presses of the network, and of its estimate times one factor.
 
+    Args:
+        rows: All rows.
+        chosen: Those of the cell.
+        net: The network.
+        fingertip: Of each row.
+        seed: Of the drawn presses.
+
     Returns:
-        By number of presses the medians by name of the rival, all on the same rows; empty where no
-        specimen has presses enough for one.
+        By number of presses the medians by name of the rival, and ``held_bounds``, all on the same
+        rows; empty where no specimen has presses enough for one.
     """
     for most in sorted(SHOTS, reverse=True):
         drawn = draw_shots(rows, chosen, most=most, draws=SHOT_DRAWS, seed=seed) if most else []
@@ -161,6 +169,9 @@ def shots_table(
             name: figures(net.quantities, estimate, truth, specimen, ends=name == "network")
             for name, estimate in table.items()
         }
+        found[str(shots)]["bounds"] = held_bounds(
+            net.quantities, table["network"], rows, tested, fingertip
+        )
     return found
 
 
