@@ -171,7 +171,7 @@ def run_transfer(
             "interval_median_n": float(np.median(half)),
         }
         found[""].append(result)
-        for name, estimate in _baselines(train, test, labelled.rows, tested).items():
+        for name, estimate in baselines_of(train, test, labelled.rows, tested).items():
             found[name].append(summary(estimate, truth))
         on_step()
     means = {
@@ -278,7 +278,7 @@ def _half(recording: FingerRecording, which: int) -> FingerRecording:
     )
 
 
-def _baselines(
+def baselines_of(
     train: Sequence[Finger], test: Finger, labelled: Rows, tested: Rows
 ) -> dict[str, Floats]:
     """Estimates of the tested rows by a constant and by a ridge regression on tared counts.
