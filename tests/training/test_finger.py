@@ -9,16 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from onnxruntime import InferenceSession
 
+import palpate_training
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import read_bundle
+from palpate_training.datasets.experiment import read_mixed
+from palpate_training.datasets.export import features
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.learning.force_process import Floats, ForceProcesses, KnownRows
+from palpate_training.learning.told_finger import ToldFinger
 from palpate_training.learning.twin_line import read_line
 from palpate_training.tasks import finger
-from palpate_training.tasks.finger import STEPS, known_rows, train_finger
+from palpate_training.tasks.finger import STEPS, estimate_of, known_rows, train_finger
 
 MakeData = Callable[..., FeatureDataset]
+SAMPLE = Path(palpate_training.__file__).parent / "samples" / "twin.h5"
 
 
 @pytest.fixture(autouse=True)
@@ -53,6 +59,52 @@ def test_a_bundle_of_its_own(press_data: MakeData, tmp_path: Path) -> None:
     answers = bundle.golden["force"]
     assert np.isfinite(answers).all()
     assert 2.0 < np.linalg.norm(answers, axis=1).max() < 6.0
+
+
+@pytest.fixture(scope="module")
+def simulated() -> FeatureDataset:
+    """The sample's presses of one of the twin's specimens, which the network has not met."""
+    data = features(read_mixed(SAMPLE))
+    kept = data.sensor == data.sensor_names.index("biotac-2")
+    columns = {name: values[kept] for name, values in data.arrays().items()}
+    columns["sensor"] = np.zeros(kept.sum(), np.int32)
+    return replace(data, **columns, sensor_names=("biotac-2",))
+
+
+def test_a_simulated_finger_gets_the_network_of_the_population(
+    simulated: FeatureDataset, tmp_path: Path
+) -> None:
+    report = train_finger(simulated, tmp_path / "b", name="features-mine")
+    assert "population" in report.estimator
+    manifest = read_bundle(tmp_path / "b").manifest
+    assert {"contact_location", "contact_normal_sd"} <= {one.name for one in manifest.outputs}
+    assert manifest.intervals is not None
+    assert "contact_location" in {one.name for one in manifest.intervals.formulas}
+    # The sensor tells no place: what is known of that comes from the population alone.
+    session = InferenceSession((tmp_path / "b" / "model.onnx").read_bytes())
+    names = [one.name for one in session.get_outputs()]
+    hard = np.linalg.norm(simulated.force, axis=1) > 0.5
+    answers = dict(
+        zip(names, session.run(None, {"electrodes": simulated.tared_counts}), strict=True)
+    )
+    assert simulated.contact_location is not None
+    apart = np.linalg.norm(answers["contact_location"] - simulated.contact_location, axis=1)[hard]
+    assert np.median(apart) < 2.5e-3
+    assert report.metrics["force_magnitude_median_n"] < 0.15
+    line = report.metrics["linear_force_magnitude_median_n"]
+    assert report.metrics["force_magnitude_median_n"] < 0.5 * line
+
+
+def test_a_finger_that_is_told_is_another_one(simulated: FeatureDataset) -> None:
+    """The same electrodes with forces three times as large: presses tell it."""
+    known, touched = known_rows(simulated)
+    rest = simulated.baseline[0].astype(np.float64)
+    harder = replace(known, force=3.0 * known.force)
+    once, thrice = (
+        np.linalg.norm(estimate_of(ToldFinger(rows, rest), known.tared[touched]), axis=1)
+        for rows in (known, harder)
+    )
+    assert 2.0 < np.median(thrice / once) < 4.0
 
 
 def test_what_is_said_of_it_comes_from_presses_that_were_held_out(

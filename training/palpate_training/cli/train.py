@@ -414,7 +414,7 @@ def train_population_command(
             for key in shots["0"]:
                 if key != "ci95":
                     table.add_row(key, *(f"{one[key]:.3f}" for one in shots.values()))
-            for name in cell["shots"]["0"]["bounds"]:
+            for name in cell["shots"]["0"].get("bounds", ()):
                 held = (cell["shots"][key]["bounds"][name]["held"] for key in shots)
                 table.add_row(f"bound of {name} holds", *(f"{100 * one:.1f} %" for one in held))
             console.print(table)

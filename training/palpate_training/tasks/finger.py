@@ -1,7 +1,9 @@
 """A finger's own ``features`` bundle, from presses against a force/torque sensor.
 
 The bundle estimates the force of this one finger. Which estimator it holds is chosen on presses
-that are held out, and what is said of it is measured on others, held out from that choice, too.
+that are held out, and what is said of it is measured on others, held out from that choice, too. A
+finger that the network of a simulated population knows best, once it is told these presses, gets
+that network's contact location, centre of pressure and contact normal as well.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from palpate_training.learning.graphs import FeaturesGraph
 from palpate_training.learning.intervals import LEVEL, bounds, fit_formulas, terms_of
 from palpate_training.learning.metrics import force_errors, force_metrics
 from palpate_training.learning.ranges import ends_of, known_inputs
+from palpate_training.learning.told_finger import ToldFinger
 from palpate_training.tasks.features import threshold_above
 
 Floats = npt.NDArray[np.float64]
@@ -71,6 +74,7 @@ ESTIMATORS: dict[str, Estimator] = {
         f"Gaussian processes, locality {local:g}": partial(ForceProcesses, local=local)
         for local in LOCALITIES
     },
+    "network of a simulated population, told by the presses": ToldFinger,
 }
 """What is chosen from."""
 
@@ -146,9 +150,18 @@ def train_finger(
     presses = len(np.unique(known.press[touched]))
     source = f"{len(known)} rows of {data.provenance.source}"
     formulas = finger_formulas(held_out[touched], known.force[touched], known.press[touched])
+    of_contact: dict[str, npt.NDArray[np.float32]] = {}
+    described = {}
+    if isinstance(net, ToldFinger):  # the finger is like simulated ones, so more is known of it
+        of_contact = net.told.contact_sd
+        described["of a contact"] = (
+            f"estimates of the network; their errors are those on {net.told.source}"
+        )
+        if formulas and net.told.location_bound is not None:
+            formulas = (*formulas, net.told.location_bound)
     digest = export_features(
         folder,
-        FeaturesGraph(net, force_sd.astype(np.float32)),
+        FeaturesGraph(net, force_sd.astype(np.float32), of_contact),
         known.tared[np.linspace(0, len(known) - 1, _GOLDEN_ROWS).astype(int)].astype(np.float32),
         name=name,
         version=version,
@@ -160,6 +173,7 @@ def train_finger(
             "estimator": estimator,
             "force_sd": f"{LEVEL:.0%} of the errors on presses held out, axis by axis, are within"
             f" {_DEVIATIONS:.3f} of it",
+            **described,
         },
         training_range=TrainingRange(
             source=source,
@@ -290,7 +304,7 @@ def fit_finger(rows: KnownRows, rest: Floats) -> tuple[str, nn.Module]:
 def estimate_of(net: nn.Module, tared: Floats) -> Floats:
     """Forces [N], shape (N, 3), of tared counts (N, 19)."""
     with torch.inference_mode():
-        return np.asarray(net(torch.from_numpy(tared)).numpy())
+        return np.asarray(net(torch.from_numpy(tared))[:, :3].numpy())
 
 
 def _force_sd(errors: Floats, press: Rows) -> Floats:

@@ -248,18 +248,15 @@ def train_population(
                 seed=seed,
                 on_epoch=on_epoch,
             )
-        trained = {
-            "config": asdict(config),
-            "device": where,
-            "trained_s": round(time.monotonic() - begun, 1),
-        }
+        trained = {"device": where, "trained_s": round(time.monotonic() - begun, 1)}
         save_population_net(out / WEIGHTS, net)
     rivals = _rivals(net, rows.inputs, targets, split)
     cells = {name: cell(rows, chosen, net, rivals) for name, chosen in split.cells.items()}
     for name, of_cell in cells.items():
         if name != "seen_specimen_seen_press":
+            never = name == "unseen_specimen_unseen_press"
             of_cell["shots"] = shots_table(
-                rows, split.cells[name], net, fingertips_of(data), seed=seed
+                rows, split.cells[name], net, fingertips_of(data) if never else None, seed=seed
             )
     facts: dict[str, Any] = {
         "data": data.provenance.source,
@@ -271,10 +268,13 @@ def train_population(
         "specimens": len(data.sensor_names),
         "unseen_specimens": split.specimens,
         "quantities": quantities,
+        "config": asdict(net.config),
         "seed": seed,
         **trained,
         "cells": cells,
     }
+    if shots := cells["unseen_specimen_unseen_press"]["shots"]:
+        facts["told"] = shots.pop("told") | {"specimens": shots["specimens"]}
     facts["onnx"] = _export(out / ONNX, net, data, split.cells["unseen_specimen_unseen_press"])
     with written_whole(out / REPORT) as part:
         part.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
@@ -282,11 +282,11 @@ def train_population(
 
 
 def _trained_before(report: Path) -> dict[str, Any]:
-    """How the network was trained, by the report beside it; nothing where there is none."""
+    """Where the network was trained, by the report beside it; nothing where there is none."""
     if not report.exists():
         return {}
     known = json.loads(report.read_text(encoding="utf-8"))
-    return {key: known[key] for key in ("config", "device", "trained_s") if key in known}
+    return {key: known[key] for key in ("device", "trained_s") if key in known}
 
 
 def stop_rows(rows: PopulationRows, chosen: Mask, *, seed: int) -> list[StopRows]:

@@ -14,16 +14,22 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.files.intervals import TERMS
-from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning.intervals import bounds, covered, fit_formula, terms_of
-from palpate_training.learning.metrics import force_errors, interval, location_errors
+from palpate_training.learning.metrics import (
+    angles,
+    force_errors,
+    interval,
+    location_errors,
+    rms,
+)
 from palpate_training.learning.population_fit import PopulationRows
 
 Floats = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.integer]
 
-FOLLOWED = tuple(term != "distance" for term in TERMS)
-"""A bound follows all but the distance from known inputs, of which this network has none."""
+FOLLOWED = tuple(term in ("one", "size", "large size") for term in TERMS)
+"""A bound follows the estimated force: this network knows no inputs to be far from, and what the
+electrodes have in common changes no bound (training/LOG.md)."""
 
 DRAWS = 1000
 
@@ -49,18 +55,8 @@ def held_bounds(
         specimen; ``worst``, of a specimen; ``bound`` and ``error``, medians [N or m], and the
         number of ``specimens``. Empty where there are not two.
     """
-    truth, specimen = rows.targets[tested], rows.specimen[tested]
-    press = np.unique(np.stack([specimen, rows.press[tested]]), axis=1, return_inverse=True)[1]
-    size = np.linalg.norm(estimate[:, :3].astype(np.float64), axis=1)
-    common = rows.inputs[tested, :ELECTRODES].mean(axis=1, dtype=np.float64)
-    terms = terms_of(size, common, np.zeros(len(size)))
-    errors = {"force_magnitude": force_errors(estimate[:, :3], truth[:, :3])["magnitude_n"]}
-    if "contact_location" in quantities:
-        at = 3 * quantities.index("contact_location")
-        part = slice(at, at + 3)
-        errors["contact_location"] = location_errors(estimate[:, part], truth[:, part])[
-            "distance_m"
-        ]
+    errors, terms, press = _bounded(quantities, estimate, rows, tested)
+    specimen = rows.specimen[tested]
     found: dict[str, Any] = {}
     for name, error in errors.items():
         bound = np.full(len(error), np.nan)
@@ -83,6 +79,60 @@ def held_bounds(
             "specimens": len(share),
         }
     return found
+
+
+def told_errors(
+    quantities: tuple[str, ...],
+    estimate: npt.NDArray[np.floating],
+    rows: PopulationRows,
+    tested: Labels,
+) -> dict[str, Any]:
+    """What a finger that is told by presses needs to know of the network's errors.
+
+    Args:
+        quantities: Of the network, force first.
+        estimate: Of rows that it has not met, with presses known, shape ``(T, 3 Q)``.
+        rows: All rows.
+        tested: Numbers of these rows, shape ``(T,)``.
+
+    Returns:
+        ``sd`` by quantity: root mean square errors per axis, of a normal that of its angle;
+        ``bounds``: weights of ``TERMS`` by name.
+    """
+    truth = rows.targets[tested]
+    spread = {}
+    for number, name in enumerate(quantities):
+        part = slice(3 * number, 3 * number + 3)
+        known = np.isfinite(truth[:, part]).all(axis=1)
+        guess, right = (values[known, part] for values in (estimate, truth))
+        error = angles(guess, right)[:, None] if name == "contact_normal" else guess - right
+        spread[name] = [float(f"{one:.6g}") for one in rms(error)]
+    errors, terms, press = _bounded(quantities, estimate, rows, tested)
+    formulas = {
+        name: fit_formula(name, error, terms, press, use=FOLLOWED).weights
+        for name, error in errors.items()
+    }
+    return {"sd": spread, "bounds": formulas}
+
+
+def _bounded(
+    quantities: tuple[str, ...],
+    estimate: npt.NDArray[np.floating],
+    rows: PopulationRows,
+    tested: Labels,
+) -> tuple[dict[str, Floats], Floats, Labels]:
+    """Errors that have a bound, by name, the terms of each row, and its press of its specimen."""
+    truth = rows.targets[tested]
+    both = np.stack([rows.specimen[tested], rows.press[tested]])
+    press = np.unique(both, axis=1, return_inverse=True)[1]
+    nothing = np.zeros(len(tested))
+    size = np.linalg.norm(estimate[:, :3].astype(np.float64), axis=1)
+    errors = {"force_magnitude": force_errors(estimate[:, :3], truth[:, :3])["magnitude_n"]}
+    if "contact_location" in quantities:
+        at = 3 * quantities.index("contact_location")
+        found = location_errors(estimate[:, at : at + 3], truth[:, at : at + 3])
+        errors["contact_location"] = found["distance_m"]
+    return errors, terms_of(size, nothing, nothing), press
 
 
 def _halves(

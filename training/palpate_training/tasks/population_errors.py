@@ -26,7 +26,7 @@ from palpate_training.learning.metrics import (
 from palpate_training.learning.networks import predict
 from palpate_training.learning.population_fit import PopulationRows
 from palpate_training.learning.population_net import PopulationNet
-from palpate_training.tasks.population_bounds import held_bounds
+from palpate_training.tasks.population_bounds import held_bounds, told_errors
 
 FloatArray = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -125,7 +125,12 @@ def cell(
 
 
 def shots_table(
-    rows: PopulationRows, chosen: Mask, net: PopulationNet, fingertip: Rows, *, seed: int
+    rows: PopulationRows,
+    chosen: Mask,
+    net: PopulationNet,
+    fingertip: Rows | None = None,
+    *,
+    seed: int,
 ) -> dict[str, Any]:
     """Errors by number of known presses of the network, and of its estimate times one factor.
 
@@ -133,12 +138,13 @@ def shots_table(
         rows: All rows.
         chosen: Those of the cell.
         net: The network.
-        fingertip: Of each row.
+        fingertip: Of each row, where bounds are wanted, too.
         seed: Of the drawn presses.
 
     Returns:
         By number of presses the medians by name of the rival, and ``held_bounds``, all on the same
-        rows; empty where no specimen has presses enough for one.
+        rows, and ``told_errors`` with the most presses; empty where no specimen has presses enough
+        for one.
     """
     for most in sorted(SHOTS, reverse=True):
         drawn = draw_shots(rows, chosen, most=most, draws=SHOT_DRAWS, seed=seed) if most else []
@@ -169,9 +175,11 @@ def shots_table(
             name: figures(net.quantities, estimate, truth, specimen, ends=name == "network")
             for name, estimate in table.items()
         }
-        found[str(shots)]["bounds"] = held_bounds(
-            net.quantities, table["network"], rows, tested, fingertip
-        )
+        if fingertip is not None:
+            known = (net.quantities, table["network"], rows, tested)
+            found[str(shots)]["bounds"] = held_bounds(*known, fingertip)
+            if shots == most:
+                found["told"] = {"shots": shots} | told_errors(*known)
     return found
 
 
