@@ -8,7 +8,7 @@ r"""Write docs/results/population.md: a large simulated set, and one network for
     palpate train population features.h5 OUT                            OUT/population.json
     python docs/make_population.py --network OUT                        keeps that report
     ... draw 240 --seed 3, --random 40000 --fingertips 40 --seed 3 and a plate (LOG), OUT of it
-    python docs/make_population.py --second OUT                         keeps that report
+    python docs/make_population.py --second OUT                         network and report ship
     python docs/make_population.py                                      page and pictures
 
 What the commands wrote is in docs/results/population.
@@ -20,6 +20,7 @@ import argparse
 import json
 import math
 import re
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -38,6 +39,8 @@ from palpate_training.figures.style import (
     new_figure,
     unit_colour,
 )
+from palpate_training.learning.population_net import WEIGHTS
+from palpate_training.learning.told_finger import REPORT
 
 Floats = NDArray[np.floating[Any]]
 
@@ -45,7 +48,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "results" / "population"
 PAGE = FOLDER.with_suffix(".md")
 SET = "set.json"
-SECOND = "second.json"
+SHIPPED = ROOT / "training" / "palpate_training" / "samples"
+"""Takes network and report of the second set."""
 
 ENDS = (5.0, 50.0, 95.0)
 SKINS = {
@@ -274,7 +278,8 @@ def shots_table(reports: list[dict[str, Any]]) -> str:
         ratio = known[:, -1] / of_met
         rows.append(
             [name, f"{of_met.mean():.3g}", *(f"{value:.3g}" for value in known.mean(axis=0)),
-             f"{ratio.mean():.2f} ({ratio.min():.2f}-{ratio.max():.2f})",
+             f"{ratio.mean():.2f}"
+             + f" ({ratio.min():.2f}-{ratio.max():.2f})" * (len(reports) > 1),
              f"{factor:.3g}" if "force" in figure else "", f"{moved:.3g}"]
         )  # fmt: skip
     head = ["median error", f"finger met, {most}", *(f"not met, {key}" for key in shots)]
@@ -368,7 +373,9 @@ SECOND_SET = """## A second set, and bounds
 
 {presses:,} more presses ({all:,} rows) on {fingertips} other fingertips with {specimens} other
 specimens, a plate among the indenters ([LOG](../../training/LOG.md)); content of the features file:
-sha256 {sha}. The same network, learned from {train:,} of these rows (seed {seed}, {epochs} passes);
+sha256 {sha}.
+The same network, learned from {train:,} of these rows (seed {seed}, {epochs} passes), ships, and is
+[one of the estimators](../adr/0025-calibrated-fingers.md) of `palpate calibrate`;
 {count} specimens of fingertips that were not met, the same {rows:,} rows for any number of presses:
 """
 
@@ -406,7 +413,7 @@ TOLD = """## What it says
   {met:.3f} N, {ratio:.2f} times as much (goal 1.2). Without one, forces are too small or too large
   by one factor: {force_0:.2f} N; with one press {force_1:.2f} N, with five {force_5:.2f} N. One
   factor fitted to the ten presses reaches {factor:.2f} N. Centre and normal have a ratio of
-  {ratio_centre:.2f} and {ratio_normal:.2f}.
+  {ratio_centre:.2f} and {ratio_normal:.2f}; on the second set all quantities have {ratio_second}.
 * **The electrodes at rest are not read.** They name a specimen of the training, which is then known
   by heart; presses count for nothing, and a finger that was not met is estimated twice as badly
   ([LOG](../../training/LOG.md)).
@@ -463,8 +470,13 @@ def told(reports: list[dict[str, Any]], second: dict[str, Any]) -> str:
             ("location", "1", "contact_location"),
         )
     }
+    met_second, never_second = (
+        second["cells"][cell]["shots"]["10"]["network"] for cell in (met, never)
+    )
+    ratios = [never_second[figure] / met_second[figure] for figure in FIGURES]
     return TOLD.format(
         **held,
+        ratio_second=f"{min(ratios):.2f} to {max(ratios):.2f}",
         met=known(met, "10"),
         **{f"force_{n}": known(never, n) for n in ("0", "1", "5", "10")},
         ratio=ratio(key),
@@ -499,9 +511,13 @@ def main() -> None:
         text = json.dumps({"told": options.told} | found, indent=1)
         (FOLDER / SET).write_text(text + "\n", encoding="utf-8")
         return
-    if source := options.network or options.second:
-        report = json.loads((source / "population.json").read_text(encoding="utf-8"))
-        path = FOLDER / (SECOND if options.second else f"network-seed{report['seed']}.json")
+    if options.second:
+        for name in (WEIGHTS, REPORT):
+            shutil.copyfile(options.second / name, SHIPPED / name)
+        return
+    if options.network:
+        report = json.loads((options.network / REPORT).read_text(encoding="utf-8"))
+        path = FOLDER / f"network-seed{report['seed']}.json"
         path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
         return
     found = json.loads((FOLDER / SET).read_text(encoding="utf-8"))
@@ -509,7 +525,7 @@ def main() -> None:
     reports = [json.loads(path.read_text(encoding="utf-8")) for path in kept]
     draw_set(found, FOLDER / "set.png")
     draw_network(reports[0], FOLDER / "network.png")
-    second = json.loads((FOLDER / SECOND).read_text(encoding="utf-8"))
+    second = json.loads((SHIPPED / REPORT).read_text(encoding="utf-8"))
     PAGE.write_text(page(found, reports, second).rstrip() + "\n", encoding="utf-8")
 
 

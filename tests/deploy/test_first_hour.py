@@ -26,8 +26,9 @@ pytest.importorskip("torch")
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 240.0
 
-AS_SAID = 1.2
-"""Times the bundle's own figure that the error on other presses may be."""
+AS_SAID = 2.0
+"""Times the bundle's own figure that the error may be: both are of ten touches, most of them soft,
+of which a bundle is off by 0.05 to 0.1 N."""
 
 ALIKE = 0.9
 """Least correlation of estimates with the truth; 0.3 s late it is smaller."""

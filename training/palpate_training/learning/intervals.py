@@ -108,6 +108,31 @@ def fit_formula(
     return BoundFormula(name, BOUND_UNITS[name], tuple(float(f"{w:.6g}") for w in weights))
 
 
+def widened(
+    formula: BoundFormula,
+    name: str,
+    errors: Floats,
+    terms: Floats,
+    press: Labels,
+    *,
+    level: float = LEVEL,
+) -> BoundFormula:
+    """A bound that follows a frame as another one does, by as much wider or closer as these errors.
+
+    Args:
+        formula: Of other presses, of the same kind of estimate.
+        name: A key of ``BOUND_UNITS``.
+        errors: Of rows that no training saw, shape ``(N,)``, in the unit of that error.
+        terms: As ``terms_of`` gives them.
+        press: Press of every row, shape ``(N,)``.
+        level: Share of the errors of the next press that shall lie within.
+    """
+    weights = np.array(formula.weights)
+    left = np.log(np.maximum(errors, ERROR_LEAST)) - terms @ weights
+    weights[0] += press_quantile(left, press, level)
+    return BoundFormula(name, BOUND_UNITS[name], tuple(float(f"{w:.6g}") for w in weights))
+
+
 def bounds(formula: BoundFormula, terms: Floats) -> Floats:
     """The bound of every row, shape ``(N,)``."""
     return np.array([formula.bound(tuple(row)) for row in terms.tolist()])

@@ -46,13 +46,13 @@ class ToldNetwork:
     Attributes:
         net: The network.
         contact_sd: Of what only a contact has, by name, as ``FeaturesGraph`` takes it.
-        location_bound: Of the error of the contact location; None = not known.
+        bounds: Of errors, by name, as far as they are known.
         source: What is known of it, for people.
     """
 
     net: PopulationNet
     contact_sd: dict[str, FloatArray]
-    location_bound: BoundFormula | None
+    bounds: dict[str, BoundFormula]
     source: str
 
 
@@ -65,13 +65,13 @@ def read_told_network(folder: Path) -> ToldNetwork:
     net = load_population_net(folder / WEIGHTS)
     report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
     told = report["told"]
-    weights = told["bounds"].get("contact_location")
     return ToldNetwork(
         net,
         {name: np.asarray(told["sd"][name], np.float32) for name in net.quantities[1:]},
-        None
-        if weights is None
-        else BoundFormula("contact_location", BOUND_UNITS["contact_location"], tuple(weights)),
+        {
+            name: BoundFormula(name, BOUND_UNITS[name], tuple(weights))
+            for name, weights in told["bounds"].items()
+        },
         f"{told['specimens']} simulated specimens that the network had not met,"
         f" {told['shots']} presses of each known",
     )

@@ -30,7 +30,7 @@ from palpate_training.learning.force_process import (
     KnownRows,
 )
 from palpate_training.learning.graphs import FeaturesGraph
-from palpate_training.learning.intervals import LEVEL, bounds, fit_formulas, terms_of
+from palpate_training.learning.intervals import LEVEL, bounds, fit_formulas, terms_of, widened
 from palpate_training.learning.metrics import force_errors, force_metrics
 from palpate_training.learning.ranges import ends_of, known_inputs
 from palpate_training.learning.told_finger import ToldFinger
@@ -149,19 +149,21 @@ def train_finger(
             metrics[f"{other}_{key}"] = found[key]
     presses = len(np.unique(known.press[touched]))
     source = f"{len(known)} rows of {data.provenance.source}"
-    formulas = finger_formulas(held_out[touched], known.force[touched], known.press[touched])
-    of_contact: dict[str, npt.NDArray[np.float32]] = {}
-    described = {}
-    if isinstance(net, ToldFinger):  # the finger is like simulated ones, so more is known of it
-        of_contact = net.told.contact_sd
-        described["of a contact"] = (
-            f"estimates of the network; their errors are those on {net.told.source}"
-        )
-        if formulas and net.told.location_bound is not None:
-            formulas = (*formulas, net.told.location_bound)
+    # A finger that the network knows is like simulated ones, so more is known of it.
+    told = net.told if isinstance(net, ToldFinger) else None
+    formulas = finger_formulas(
+        held_out[touched],
+        known.force[touched],
+        known.press[touched],
+        follow=told.bounds["force_magnitude"] if told else None,
+    )
+    described: dict[str, str] = {}
+    if told:
+        formulas = (*formulas, told.bounds["contact_location"])
+        described["of a contact"] = f"of the network; errors are those on {told.source}"
     digest = export_features(
         folder,
-        FeaturesGraph(net, force_sd.astype(np.float32), of_contact),
+        FeaturesGraph(net, force_sd.astype(np.float32), told.contact_sd if told else None),
         known.tared[np.linspace(0, len(known) - 1, _GOLDEN_ROWS).astype(int)].astype(np.float32),
         name=name,
         version=version,
@@ -202,26 +204,36 @@ STEPS = FOLDS + 1
 """How often ``train_finger`` calls ``on_step``."""
 
 
-def finger_formulas(held_out: Floats, force: Floats, press: Rows) -> tuple[BoundFormula, ...]:
+def finger_formulas(
+    held_out: Floats, force: Floats, press: Rows, *, follow: BoundFormula | None = None
+) -> tuple[BoundFormula, ...]:
     """Bounds of the errors of the next press; none that lies beyond every force of the presses.
 
     Args:
         held_out: Forces estimated without the press that is estimated [N], shape ``(N, 3)``.
         force: The true ones.
         press: Press of each row, shape ``(N,)``.
+        follow: How bounds follow a frame; None = as these presses say.
     """
     found = force_errors(held_out, force)
     size = np.linalg.norm(held_out, axis=1)
     # Its own rows are its training range: they say nothing of how errors grow away from it.
     nothing = np.zeros(len(size))
     terms = terms_of(size, nothing, nothing)
-    formulas = fit_formulas(
-        {"force_magnitude": found["magnitude_n"], "force": found["vector_n"]},
-        terms,
-        press,
-        level=LEVEL,
-        use=OF_FINGER if len(np.unique(press)) >= PRESSES_SLOPE else OF_FEW,
-    )
+    errors = {"force_magnitude": found["magnitude_n"], "force": found["vector_n"]}
+    if follow is not None:
+        formulas = tuple(
+            widened(follow, name, error, terms, press, level=LEVEL)
+            for name, error in errors.items()
+        )
+    else:
+        formulas = fit_formulas(
+            errors,
+            terms,
+            press,
+            level=LEVEL,
+            use=OF_FINGER if len(np.unique(press)) >= PRESSES_SLOPE else OF_FEW,
+        )
     # Of a few presses that are unlike one another it comes out as hundreds of newtons: unknown.
     strongest_n = np.linalg.norm(force, axis=1).max()
     return tuple(one for one in formulas if np.median(bounds(one, terms)) <= strongest_n)
