@@ -13,6 +13,7 @@ import json
 import math
 import re
 import runpy
+import statistics
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -153,6 +154,43 @@ def _real_force() -> Iterator[Claim]:
         " finger 2 has {long2n} N, and an unseen finger {unseen1n} to {unseen2n} N",
         figures,
     )
+
+
+def _calibrated() -> Iterator[Claim]:
+    """What a simulated finger learns from ten presses."""
+    cells = _read("calibrate.json")["simulated"]["calibrate"]
+    told = [
+        found
+        for cell in cells
+        if cell["shots"] == 10
+        for found in cell.values()
+        if isinstance(found, dict) and "location_mm" in found
+    ]
+    figures = {
+        "force": f"{statistics.mean(one['magnitude_n'] for one in told):.2f}",
+        "location": f"{statistics.mean(one['location_mm'] for one in told):.2f}",
+    }
+    yield Claim(
+        "README.md",
+        "a simulated finger that no training has met: {force} N and {location} mm after ten",
+        figures,
+    )
+
+
+def _chaos() -> Iterator[Claim]:
+    """Half an hour in which one thing after another breaks."""
+    found = _read("chaos.json")
+    figures = {
+        "minutes": f"{found['minutes']:.0f}",
+        "faults": str(len(found["events"])),
+        "missing": f"{found['frames']['missing']:,}",
+    }
+    yield Claim(
+        "README.md",
+        "for {minutes} minutes: processes, disk, clock, network and sensor broken {faults} times",
+        figures,
+    )
+    yield Claim("README.md", "stale or repeated; {missing} missing frames, each counted", figures)
 
 
 def _twin() -> Iterator[Claim]:
@@ -336,6 +374,8 @@ def claims() -> list[Claim]:
         *_fem(),
         *_real_force(),
         *_twin(),
+        *_calibrated(),
+        *_chaos(),
         *_serving(),
         *_restarts(),
         *_readers(),

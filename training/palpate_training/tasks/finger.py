@@ -301,22 +301,28 @@ def fit_finger(rows: KnownRows, rest: Floats) -> tuple[str, nn.Module]:
         rows: Of at least three presses.
         rest: Untouched counts, shape (19,).
     """
-
-    def error(estimator: Estimator) -> float:
-        total = 0.0
-        for out in _folds(rows.press, CHOICES):
-            estimate = estimate_of(estimator(rows.where(~out), rest), rows.tared[out])
-            total += float(np.linalg.norm(estimate - rows.force[out], axis=1).sum())
-        return total
-
-    best = min(ESTIMATORS, key=lambda name: error(ESTIMATORS[name]))
+    best = min(ESTIMATORS, key=lambda name: error_held_out(ESTIMATORS[name], rows, rest))
     return best, ESTIMATORS[best](rows, rest)
+
+
+def error_held_out(estimator: Estimator, rows: KnownRows, rest: Floats) -> float:
+    """Mean error of the force on presses held out [N], by which an estimator is chosen."""
+    total = 0.0
+    for out in _folds(rows.press, CHOICES):
+        estimate = estimate_of(estimator(rows.where(~out), rest), rows.tared[out])
+        total += float(np.linalg.norm(estimate - rows.force[out], axis=1).sum())
+    return total / len(rows)
 
 
 def estimate_of(net: nn.Module, tared: Floats) -> Floats:
     """Forces [N], shape (N, 3), of tared counts (N, 19)."""
+    return full_estimate_of(net, tared)[:, :3]
+
+
+def full_estimate_of(net: nn.Module, tared: Floats) -> Floats:
+    """All that an estimator gives, force first, of tared counts (N, 19)."""
     with torch.inference_mode():
-        return np.asarray(net(torch.from_numpy(tared))[:, :3].numpy())
+        return np.asarray(net(torch.from_numpy(tared)).numpy())
 
 
 def _force_sd(errors: Floats, press: Rows) -> Floats:

@@ -1,0 +1,220 @@
+r"""Write docs/results/calibrate.md, .json and .png: what `palpate calibrate` learns, by estimator.
+
+    palpate fem units draw 20 --seed 5 --out drawn.json
+    palpate data generate runs/calibrate --points 3 --angled 2 --seed 11
+    palpate data generate runs/drawn --points 2 --angled 2 --seed 13 --units drawn.json
+    python docs/make_calibrate.py runs ../shared/data       or without both: the page alone
+
+Simulated specimens learn from so many of their presses and are tested on all others; real fingers
+from their first seconds, tested on the rest. Beside each error the one on presses held out, by
+which the estimator is chosen. Numbers only are written, no rows.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from palpate_training.datasets.experiment import read_mixed
+from palpate_training.datasets.export import features
+from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.ingest import ingest_lasa
+from palpate_training.evaluation.transfer import PRESS_S, Finger, fingers_of
+from palpate_training.figures.style import markdown_table, new_figure, save
+from palpate_training.learning.force_process import KnownRows
+from palpate_training.learning.metrics import force_errors, location_errors
+from palpate_training.tasks.finger import (
+    ESTIMATORS,
+    PRESS_N,
+    ROWS_MOST,
+    error_held_out,
+    estimate_of,
+    full_estimate_of,
+)
+
+Floats = NDArray[np.float64]
+
+OUT = Path(__file__).parent / "results" / "calibrate"
+SETS = {"calibrate": "the three that ship", "drawn": "drawn ones"}
+SHOTS = (6, 10, 20)
+SPECIMENS_MOST = 8
+DRAWS = 3
+OWN_S = (30, 60, 120)
+HZ = 100
+CONSOLE = Console()
+
+
+def measured(known: KnownRows, rest: Floats, tared: Floats, force: Floats) -> dict[str, Any]:
+    """Errors of every estimator on rows that were not learned from, and on presses held out."""
+    found: dict[str, Any] = {}
+    hard = np.linalg.norm(force, axis=1) >= 2.0
+    for name, estimator in ESTIMATORS.items():
+        error = force_errors(estimate_of(estimator(known, rest), tared), force)
+        found[name] = {
+            "magnitude_n": float(np.median(error["magnitude_n"])),
+            "from_2n_percent": float(100.0 * np.median(error["magnitude_over_norm"][hard])),
+            "held_out_n": error_held_out(estimator, known, rest),
+        }
+    found["chosen"] = min(ESTIMATORS, key=lambda name: found[name]["held_out_n"])
+    return found
+
+
+def simulated(path: Path) -> list[dict[str, Any]]:
+    """Every specimen of a mixed data set, with so many presses known."""
+    data = features(read_mixed(path))
+    size = np.linalg.norm(data.force, axis=1)
+    cells = []
+    for specimen in range(min(SPECIMENS_MOST, len(data.sensor_names))):
+        own = np.flatnonzero(data.sensor == specimen)
+        hardest = {g: size[own[data.group[own] == g]].max() for g in np.unique(data.group[own])}
+        presses = np.array([group for group, most in hardest.items() if most >= PRESS_N])
+        for shots in SHOTS:
+            for draw in range(DRAWS):
+                rng = np.random.default_rng([draw, specimen])
+                some = rng.permutation(presses)[:shots]
+                if len(some) == shots and shots < len(presses):
+                    cells.append(one_draw(data, own, some) | {"shots": shots, "draw": draw})
+    return cells
+
+
+def one_draw(data: FeatureDataset, own: NDArray[np.integer], presses: Any) -> dict[str, Any]:
+    """A specimen that learns from some presses, tested on its others."""
+    learned = own[np.isin(data.group[own], presses)]
+    others = own[~np.isin(data.group[own], presses)]
+    others = others[np.linalg.norm(data.force[others], axis=1) >= PRESS_N]
+    known = KnownRows(
+        data.tared_counts[learned].astype(np.float64),
+        data.force[learned].astype(np.float64),
+        data.group[learned],
+    )
+    rest = data.baseline[own].mean(axis=0, dtype=np.float64)
+    tared = data.tared_counts[others].astype(np.float64)
+    found = measured(known, rest, tared, data.force[others].astype(np.float64))
+    told = list(ESTIMATORS)[-1]
+    place = full_estimate_of(ESTIMATORS[told](known, rest), tared)[:, 3:6]
+    assert data.contact_location is not None
+    apart = location_errors(place, data.contact_location[others])["distance_m"]
+    found[told]["location_mm"] = float(1e3 * np.nanmedian(apart))
+    return found | {"specimen": data.sensor_names[data.sensor[own[0]]]}
+
+
+def real(finger: Finger, seconds: int) -> dict[str, Any]:
+    """A real finger from its own first seconds, tested on all that comes later."""
+    force, tared = finger.recording.force, finger.tared.astype(np.float64)
+    first = np.unique(np.linspace(0, seconds * HZ - 1, ROWS_MOST).astype(int))
+    later = np.arange((seconds + 1) * HZ, len(force))
+    known = KnownRows(tared[first], force[first], first // round(PRESS_S * HZ))
+    rest = finger.recording.baseline.mean(axis=0, dtype=np.float64)
+    found = measured(known, rest, tared[later], force[later])
+    return found | {"finger": finger.name, "seconds": seconds}
+
+
+def page(facts: dict[str, Any]) -> str:
+    """The Markdown page of the facts."""
+    names = list(ESTIMATORS)
+    rows = []
+    for key, cells in facts["simulated"].items():
+        for shots in SHOTS:
+            some = [one for one in cells if one["shots"] == shots]
+            if not some:
+                continue
+            right = np.mean([one["chosen"] == names[-1] for one in some])
+            rows.append(
+                [f"{SETS[key]}, {shots} presses", str(len({one["specimen"] for one in some})),
+                 *(f"{mean(some, name, 'magnitude_n'):.3f} N,"
+                   f" {mean(some, name, 'from_2n_percent'):.0f} %" for name in names),
+                 f"{100.0 * right:.0f} %", f"{mean(some, names[-1], 'location_mm'):.2f} mm"]
+            )  # fmt: skip
+    real_rows = [
+        [f"{one['finger']}, {one['seconds']} s",
+         *(f"{one[name]['magnitude_n']:.3f} ({one[name]['held_out_n']:.2f})" for name in names),
+         one["chosen"]]
+        for one in facts["real"]
+    ]  # fmt: skip
+    head = ["specimens", "number", *names, "the last is chosen", "its location"]
+    return f"""# What a finger learns from its own presses
+
+Made by `python docs/make_calibrate.py runs ../shared/data`, whose head names the commands before
+it. `palpate calibrate` [chooses](../adr/0025-calibrated-fingers.md) among four estimators by their
+error on presses held out.
+
+![errors](calibrate.png)
+
+## Simulated fingers
+
+Specimens of the twin, neither of which nor whose skin the [population's network](population.md) has
+met. Median error of the force on all presses that were not learned from, and from 2 N in percent of
+the force; means over specimens and {facts["draws"]} draws of the presses. A force/torque sensor
+does not tell where a finger is touched; the network does (median error of the contact location).
+`features-twin`, which was trained on the three that ship, has 0.074 N and 0.88 mm on
+[presses like these](intervals.md).
+
+{markdown_table(head, rows)}
+## Real fingers
+
+The two fingers of the LASA force calibration, from their first seconds, tested on the rest: median
+error of the magnitude [N], and in brackets the mean error on presses held out, which chooses.
+
+{markdown_table(["", *names, "chosen"], real_rows)}
+So a network of simulated fingers is taken where a finger is like them, and not on a real one: there
+presses held out tell at once that it does not fit.
+"""
+
+
+def mean(cells: list[dict[str, Any]], name: str, figure: str) -> float:
+    """Of an estimator's figure over cells."""
+    return float(np.mean([one[name][figure] for one in cells]))
+
+
+def draw(facts: dict[str, Any]) -> None:
+    """Errors by number of presses."""
+    figure = new_figure(9.0, 3.2)
+    colours = ("0.75", "#d9a441", "#b5541c", "#1f5a94")
+    for axis, (key, cells) in zip(
+        figure.subplots(1, 2, sharey=True), facts["simulated"].items(), strict=True
+    ):
+        for number, (name, colour) in enumerate(zip(ESTIMATORS, colours, strict=True)):
+            shots = [n for n in SHOTS if any(one["shots"] == n for one in cells)]
+            values = [
+                mean([one for one in cells if one["shots"] == n], name, "magnitude_n")
+                for n in shots
+            ]
+            places = np.arange(len(shots)) + 0.2 * (number - 1.5)
+            axis.bar(places, values, 0.19, color=colour, label=name)
+        axis.set_xticks(range(len(shots)), [str(n) for n in shots])
+        axis.set_title(f"simulated specimens: {SETS[key]}", fontsize=9)
+        axis.set_xlabel("presses of the finger that are known")
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel("median error of the force [N]")
+    figure.axes[0].set_ylim(top=1.35)  # room for the legend
+    figure.axes[1].legend(frameon=False, fontsize=8)
+    save(figure, OUT.with_suffix(".png"))
+
+
+def main(arguments: list[str]) -> None:
+    """Measure, if folders are given, and write what was measured."""
+    if arguments:
+        runs, data = map(Path, arguments)
+        facts: dict[str, Any] = {"draws": DRAWS, "simulated": {}, "real": []}
+        for key in SETS:
+            CONSOLE.print(f"simulated: {SETS[key]}")
+            facts["simulated"][key] = simulated(runs / key / "mixed.h5")
+        archive = data / "lasa_force_calibration" / "force_calibration.npz"
+        for finger in fingers_of(ingest_lasa(archive)):
+            CONSOLE.print(f"real: {finger.name}")
+            facts["real"] += [real(finger, seconds) for seconds in OWN_S]
+        text = json.dumps(facts, indent=1)
+        OUT.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+    kept = json.loads(OUT.with_suffix(".json").read_text(encoding="utf-8"))
+    OUT.with_suffix(".md").write_text(page(kept), encoding="utf-8")
+    draw(kept)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
