@@ -27,9 +27,9 @@ from palpate_training.learning.population_net import (
     load_population_net,
     save_population_net,
 )
+from palpate_training.learning.told_finger import REPORT
 from palpate_training.tasks.population import (
     ONNX,
-    REPORT,
     fingertips_of,
     points_of,
     rows_of,

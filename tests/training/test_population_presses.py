@@ -26,8 +26,8 @@ from palpate_training.learning.population_net import (
     load_population_net,
 )
 from palpate_training.learning.press_set import CalibrationPresses
+from palpate_training.learning.told_finger import REPORT, read_told_network
 from palpate_training.tasks.population import (
-    REPORT,
     fingertips_of,
     rows_of,
     train_population,
@@ -97,6 +97,20 @@ def test_a_network_is_measured_again_without_a_training(folder: Path, tmp_path: 
     assert after == before
     (tmp_path / "again" / WEIGHTS).unlink()
     assert isinstance(CliRunner().invoke(train_app, arguments).exception, DatasetError)
+
+
+def test_a_trained_folder_tells_a_finger_and_a_damaged_one_is_named(
+    folder: Path, tmp_path: Path
+) -> None:
+    told = read_told_network(folder)
+    assert set(told.contact_sd) == set(told.net.quantities[1:])
+    assert {"force_magnitude", "contact_location"} <= set(told.bounds)
+    shutil.copytree(folder, tmp_path / "damaged")
+    report = json.loads((folder / REPORT).read_text())
+    for broken in ("", "[]", json.dumps(report | {"told": {"shots": 10}})):
+        (tmp_path / "damaged" / REPORT).write_text(broken)
+        with pytest.raises(DatasetError, match="does not say how far"):
+            read_told_network(tmp_path / "damaged")
 
 
 @pytest.fixture

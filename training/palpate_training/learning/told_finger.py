@@ -20,6 +20,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from palpate.errors import DatasetError
 from palpate.files.intervals import BOUND_UNITS, BoundFormula
 from palpate_training.learning.electrode_nets import log_impedance
 from palpate_training.learning.force_process import KnownRows
@@ -63,18 +64,24 @@ def read_told_network(folder: Path) -> ToldNetwork:
         DatasetError: There is no network, or it is damaged.
     """
     net = load_population_net(folder / WEIGHTS)
-    report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
-    told = report["told"]
-    return ToldNetwork(
-        net,
-        {name: np.asarray(told["sd"][name], np.float32) for name in net.quantities[1:]},
-        {
-            name: BoundFormula(name, BOUND_UNITS[name], tuple(weights))
-            for name, weights in told["bounds"].items()
-        },
-        f"{told['specimens']} simulated specimens that the network had not met,"
-        f" {told['shots']} presses of each known",
-    )
+    path = folder / REPORT
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))["told"]
+        return ToldNetwork(
+            net,
+            {name: np.asarray(told["sd"][name], np.float32) for name in net.quantities[1:]},
+            {
+                name: BoundFormula(name, BOUND_UNITS[name], tuple(weights))
+                for name, weights in told["bounds"].items()
+            },
+            f"{told['specimens']} simulated specimens that the network had not met,"
+            f" {told['shots']} presses of each known",
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(
+            f"{path} does not say how far its network is off: {error!r}",
+            remedy="give the folder that `palpate train population` wrote",
+        ) from error
 
 
 @cache

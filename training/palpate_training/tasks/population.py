@@ -50,12 +50,12 @@ from palpate_training.learning.population_net import (
     load_population_net,
     save_population_net,
 )
+from palpate_training.learning.told_finger import REPORT
 from palpate_training.tasks.population_errors import Estimate, cell, draw_shots, shots_table
 
 FloatArray = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-REPORT = "population.json"
 ONNX = "population.onnx"
 
 UNSEEN_SPECIMENS = 0.15
