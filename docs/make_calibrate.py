@@ -14,13 +14,17 @@ from __future__ import annotations
 
 import json
 import sys
+import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from onnxruntime import InferenceSession
 from rich.console import Console
 
+from palpate.files.bundle import read_bundle
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import FeatureDataset
@@ -28,6 +32,7 @@ from palpate_training.datasets.ingest import ingest_lasa
 from palpate_training.evaluation.transfer import PRESS_S, Finger, fingers_of
 from palpate_training.figures.style import markdown_table, new_figure, save
 from palpate_training.learning.force_process import KnownRows
+from palpate_training.learning.intervals import bounds, covered, terms_of
 from palpate_training.learning.metrics import force_errors, location_errors
 from palpate_training.tasks.finger import (
     ESTIMATORS,
@@ -36,6 +41,7 @@ from palpate_training.tasks.finger import (
     error_held_out,
     estimate_of,
     full_estimate_of,
+    train_finger,
 )
 
 Floats = NDArray[np.float64]
@@ -68,12 +74,10 @@ def measured(known: KnownRows, rest: Floats, tared: Floats, force: Floats) -> di
 def simulated(path: Path) -> list[dict[str, Any]]:
     """Every specimen of a mixed data set, with so many presses known."""
     data = features(read_mixed(path))
-    size = np.linalg.norm(data.force, axis=1)
     cells = []
     for specimen in range(min(SPECIMENS_MOST, len(data.sensor_names))):
         own = np.flatnonzero(data.sensor == specimen)
-        hardest = {g: size[own[data.group[own] == g]].max() for g in np.unique(data.group[own])}
-        presses = np.array([group for group, most in hardest.items() if most >= PRESS_N])
+        presses = pressed(data, own)
         for shots in SHOTS:
             for draw in range(DRAWS):
                 rng = np.random.default_rng([draw, specimen])
@@ -102,6 +106,60 @@ def one_draw(data: FeatureDataset, own: NDArray[np.integer], presses: Any) -> di
     apart = location_errors(place, data.contact_location[others])["distance_m"]
     found[told]["location_mm"] = float(1e3 * np.nanmedian(apart))
     return found | {"specimen": data.sensor_names[data.sensor[own[0]]]}
+
+
+def bundles_bounds(path: Path, shots: int) -> dict[str, Any]:
+    """How often the bounds of specimens' own bundles hold on their other presses."""
+    data = features(read_mixed(path))
+    held: dict[str, list[tuple[float, float]]] = {}
+    for specimen in range(min(SPECIMENS_MOST, len(data.sensor_names))):
+        own = np.flatnonzero(data.sensor == specimen)
+        presses = pressed(data, own)
+        some = np.random.default_rng([0, specimen]).permutation(presses)[:shots]
+        if shots >= len(presses):
+            continue
+        learned = np.isin(data.group[own], some)
+        columns: dict[str, Any] = {
+            name: values[own[learned]] for name, values in data.arrays().items()
+        }
+        columns["sensor"] = np.zeros(learned.sum(), np.int32)
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = Path(scratch) / "bundle"
+            known = replace(data, **columns, sensor_names=(data.sensor_names[specimen],))
+            train_finger(known, folder, name="features-one")
+            formulas = read_bundle(folder).manifest.intervals
+            session = InferenceSession((folder / "model.onnx").read_bytes())
+        others = own[~learned]
+        others = others[np.linalg.norm(data.force[others], axis=1) >= PRESS_N]
+        given = session.run(None, {"electrodes": data.tared_counts[others]})
+        answers = dict(zip([one.name for one in session.get_outputs()], given, strict=True))
+        size = np.linalg.norm(answers["force"].astype(np.float64), axis=1)
+        found = force_errors(answers["force"], data.force[others])
+        errors = {"force_magnitude": found["magnitude_n"], "force": found["vector_n"]}
+        if "contact_location" in answers:
+            assert data.contact_location is not None
+            apart = location_errors(answers["contact_location"], data.contact_location[others])
+            errors["contact_location"] = apart["distance_m"]
+        terms = terms_of(size, np.zeros(len(size)), np.zeros(len(size)))
+        for one in formulas.formulas if formulas else ():
+            bound = bounds(one, terms)
+            share = covered(errors[one.name], bound, data.group[others])
+            held.setdefault(one.name, []).append((share, float(np.median(bound))))
+    return {
+        name: {
+            "held": float(np.mean([share for share, _ in values])),
+            "worst": min(share for share, _ in values),
+            "bound": float(np.mean([bound for _, bound in values])),
+            "specimens": len(values),
+        }
+        for name, values in held.items()
+    }
+
+
+def pressed(data: FeatureDataset, own: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Presses of a specimen that are hard enough to learn from, given its rows."""
+    size = np.linalg.norm(data.force[own], axis=1)
+    return np.unique(data.group[own][size >= PRESS_N])
 
 
 def real(finger: Finger, seconds: int) -> dict[str, Any]:
@@ -137,6 +195,14 @@ def page(facts: dict[str, Any]) -> str:
          one["chosen"]]
         for one in facts["real"]
     ]  # fmt: skip
+    held = [
+        [f"{SETS[key]}, {shots} presses", name, f"{100.0 * one['held']:.1f} %",
+         f"{100.0 * one['worst']:.0f} %",
+         f"{1e3 * one['bound']:.2g} mm" if "location" in name else f"{one['bound']:.2f} N"]
+        for key, by_shots in facts["bounds"].items()
+        for shots, found in by_shots.items()
+        for name, one in found.items()
+    ]  # fmt: skip
     head = ["specimens", "number", *names, "the last is chosen", "its location"]
     return f"""# What a finger learns from its own presses
 
@@ -156,6 +222,10 @@ does not tell where a finger is touched; the network does (median error of the c
 [presses like these](intervals.md).
 
 {markdown_table(head, rows)}
+How often the 90 % bounds of such a finger's bundle hold on its other presses, each press counting
+the same; of ten presses they promise more than is asked, since the next press is one more:
+
+{markdown_table(["specimens", "bound of", "holds", "worst specimen", "median bound"], held)}
 ## Real fingers
 
 The two fingers of the LASA force calibration, from their first seconds, tested on the rest: median
@@ -201,10 +271,12 @@ def main(arguments: list[str]) -> None:
     """Measure, if folders are given, and write what was measured."""
     if arguments:
         runs, data = map(Path, arguments)
-        facts: dict[str, Any] = {"draws": DRAWS, "simulated": {}, "real": []}
+        facts: dict[str, Any] = {"draws": DRAWS, "simulated": {}, "bounds": {}, "real": []}
         for key in SETS:
             CONSOLE.print(f"simulated: {SETS[key]}")
-            facts["simulated"][key] = simulated(runs / key / "mixed.h5")
+            path = runs / key / "mixed.h5"
+            facts["simulated"][key] = simulated(path)
+            facts["bounds"][key] = {str(n): bundles_bounds(path, n) for n in SHOTS[1:]}
         archive = data / "lasa_force_calibration" / "force_calibration.npz"
         for finger in fingers_of(ingest_lasa(archive)):
             CONSOLE.print(f"real: {finger.name}")
