@@ -17,11 +17,12 @@ BASELINE := tests/golden/palpate-v1.binpb
 # One worker more than cores, four at most: many tests wait for a process or for time to pass. A file
 # stays on one worker, so that its fixtures are made once. Numerical libraries would start threads
 # for every core in every worker. OMP_THREAD_LIMIT is no way to stop them: scikit-learn then merges
-# the neighbours that threads found which never ran.
+# the neighbours that threads found which never ran. Thousands of processes start; where the
+# environment asks for no bytecode, each would compile all of palpate anew.
 WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) < 3 ? $$(getconf _NPROCESSORS_ONLN) + 1 : 4)))
 PARALLEL := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
-ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
-pytest_parallel = $(ONE_THREAD) $(BIN)/pytest $(PARALLEL)
+FOR_TESTS := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=
+pytest_parallel = $(FOR_TESTS) $(BIN)/pytest $(PARALLEL)
 
 help:  ## this list
 	@echo "palpate: make <target>"
@@ -44,7 +45,7 @@ test: $(VENV)/.dev  ## all tests; the gates of `check` are among them | 15-20 mi
 	@status=0; $(pytest_parallel) || status=$$?; \
 	if [ $$status -eq 1 ]; then \
 		echo "palpate: what has failed is run once more, alone; what passes now is worth a look: it cannot stand a busy machine"; \
-		status=0; $(ONE_THREAD) $(BIN)/pytest --last-failed --last-failed-no-failures none || status=$$?; \
+		status=0; $(FOR_TESTS) $(BIN)/pytest --last-failed --last-failed-no-failures none || status=$$?; \
 	fi; exit $$status
 
 durations: $(VENV)/.dev  ## all tests; measure anew which ones `quick` leaves out | 15-20 min
