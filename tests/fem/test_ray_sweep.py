@@ -47,7 +47,7 @@ def machines() -> Iterator[Any]:
         patch.setenv("PYTHONPATH", str(Path(__file__).parent))
         found = Cluster(initialize_head=True, head_node_args={"num_cpus": CPUS})
         yield found
-        found.shutdown()  # type: ignore[no-untyped-call]
+        found.shutdown()
 
 
 @pytest.fixture(scope="module")
