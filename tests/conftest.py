@@ -56,6 +56,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # readline, which pytest loads, sets it for child processes, and consoles made at import time
     # would print narrow tables in workers only.
     os.environ.pop("COLUMNS", None)
+    # These are of the worker itself; the programs that it starts get their memory as a user's do.
+    for variable in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"):
+        os.environ.pop(variable, None)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
