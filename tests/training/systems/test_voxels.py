@@ -72,8 +72,8 @@ def test_exports_with_standard_operators(make: type) -> None:
 
 @pytest.mark.slow
 def test_both_learn(make_samples: MakeSamples, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, epochs in (("VOXEL_CONFIG", 10), ("PROJECTION_CONFIG", 80)):
-        quick = replace(getattr(voxels, name), epochs=epochs, patience=epochs, batch_rows=64)
+    for name, epochs in (("VOXEL_CONFIG", 6), ("PROJECTION_CONFIG", 30)):
+        quick = replace(getattr(voxels, name), epochs=epochs, patience=epochs, batch_rows=32)
         monkeypatch.setattr(voxels, name, quick)
     train, test = make_samples(300, seed=1), make_samples(200, seed=2)
     mean = np.repeat(train.force.mean(axis=0)[None], len(test), axis=0)
