@@ -14,13 +14,13 @@ BIN := $(VENV)/bin
 PYTHONS := $(or $(PYTHON),python3 python3.13 python3.12 python3.11)
 TORCH := torch==2.13.0
 BASELINE := tests/golden/palpate-v1.binpb
-# Two workers more than cores, four at most: many tests wait for a process or for time to pass. A file
+# One worker more than cores, four at most: many tests wait for a process or for time to pass. A file
 # stays on one worker, so that its fixtures are made once. Numerical libraries would start threads
 # for every core in every worker. OMP_THREAD_LIMIT is no way to stop them: scikit-learn then merges
 # the neighbours that threads found which never ran. Thousands of processes start; where the
 # environment asks for no bytecode, each would compile all of palpate anew.
 # MALLOC: large arrays are kept for the next ones, instead of being cleared page by page each time.
-WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) < 2 ? 3 : 4)))
+WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) < 3 ? $$(getconf _NPROCESSORS_ONLN) + 1 : 4)))
 PARALLEL := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 FOR_TESTS := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= \
              MALLOC_MMAP_THRESHOLD_=268435456 MALLOC_TRIM_THRESHOLD_=268435456
