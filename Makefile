@@ -43,14 +43,14 @@ quick: $(VENV)/.dev  ## for every save: lint, borders and most tests; types once
 
 # Hundreds of tests start processes and wait for them, and a busy machine fails one in some thousand.
 # What is broken fails alone, too. Anything but failed tests (status 1) is an end at once.
-test: $(VENV)/.dev  ## all tests; the gates of `check` are among them | 15-20 min after setup
+test: $(VENV)/.dev  ## all tests; the gates of `check` are among them | 25-30 min on two cores after setup
 	@status=0; $(pytest_parallel) || status=$$?; \
 	if [ $$status -eq 1 ]; then \
 		echo "palpate: what has failed is run once more, alone; what passes now is worth a look: it cannot stand a busy machine"; \
 		status=0; $(FOR_TESTS) $(BIN)/pytest --last-failed --last-failed-no-failures none || status=$$?; \
 	fi; exit $$status
 
-durations: $(VENV)/.dev  ## all tests; measure anew which ones `quick` leaves out | 15-20 min
+durations: $(VENV)/.dev  ## all tests; measure anew which ones `quick` leaves out | 25-30 min on two cores
 	@$(pytest_parallel) --record-durations
 
 # The gates are written here and nowhere else: tests/house/test_style.py reads and runs these lines.
