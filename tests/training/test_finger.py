@@ -21,7 +21,14 @@ from palpate_training.learning.force_process import Floats, ForceProcesses, Know
 from palpate_training.learning.told_finger import ToldFinger
 from palpate_training.learning.twin_line import read_line
 from palpate_training.tasks import finger
-from palpate_training.tasks.finger import STEPS, estimate_of, known_rows, train_finger
+from palpate_training.tasks.finger import (
+    STEPS,
+    TOLD,
+    chosen,
+    estimate_of,
+    known_rows,
+    train_finger,
+)
 
 MakeData = Callable[..., FeatureDataset]
 SAMPLE = Path(palpate_training.__file__).parent / "samples" / "twin.h5"
@@ -93,6 +100,18 @@ def test_a_simulated_finger_gets_the_network_of_the_population(
     assert report.metrics["force_magnitude_median_n"] < 0.15
     line = report.metrics["linear_force_magnitude_median_n"]
     assert report.metrics["force_magnitude_median_n"] < 0.5 * line
+
+
+def test_the_network_is_taken_only_where_it_knows_the_finger() -> None:
+    """The gateway's invented finger: the others know nothing of its hardest press, nor does it."""
+    force = np.array([[0.0, 0.0, 1.0]] * 9 + [[0.0, 0.0, 20.0]])
+    line = np.array([0.3] * 9 + [30.0])
+    for error, taken in ((0.1, TOLD), (0.9, "line")):
+        told = np.array([error] * 9 + [10.0])
+        assert told.mean() < line.mean()
+        assert chosen({"line": line, TOLD: told}, force) == taken
+    # It knows the finger, but a line knows it better.
+    assert chosen({"line": np.full(10, 0.01), TOLD: np.full(10, 0.1)}, force) == "line"
 
 
 def test_a_finger_that_is_told_is_another_one(simulated: FeatureDataset) -> None:
