@@ -72,8 +72,8 @@ TOLD = "network of a simulated population, told by the presses"
 
 LIKE_SIMULATED = 0.25
 """A finger is like simulated ones if this network is off by no more than so much of 0.5 N and the
-force, median over rows of presses held out: at most 0.15 of specimens of the twin, 0.5 and more of
-others (docs/results/calibrate.md)."""
+force, median over rows of presses held out: 0.06 to 0.21 of it on specimens of the twin, 0.34 and
+more on others (docs/results/calibrate.md)."""
 
 ESTIMATORS: dict[str, Estimator] = {
     "line": lambda rows, _: ForceLine(rows),
