@@ -29,7 +29,7 @@ from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.datasets.ingest import ingest_lasa
-from palpate_training.evaluation.transfer import PRESS_S, Finger, fingers_of
+from palpate_training.evaluation.transfer import Finger, fingers_of, first_seconds
 from palpate_training.figures.style import markdown_table, new_figure, save
 from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.intervals import bounds, covered, terms_of
@@ -56,7 +56,6 @@ SHOTS = (6, 10, 20)
 SPECIMENS_MOST = 8
 DRAWS = 3
 OWN_S = (30, 60, 120)
-HZ = 100
 CONSOLE = Console()
 
 
@@ -95,9 +94,7 @@ def simulated(path: Path) -> list[dict[str, Any]]:
 
 def one_draw(data: FeatureDataset, own: NDArray[np.integer], presses: Any) -> dict[str, Any]:
     """A specimen that learns from some presses, tested on its others."""
-    learned = own[np.isin(data.group[own], presses)]
-    others = own[~np.isin(data.group[own], presses)]
-    others = others[np.linalg.norm(data.force[others], axis=1) >= PRESS_N]
+    learned, others = dealt(data, own, presses)
     known = KnownRows(
         data.tared_counts[learned].astype(np.float64),
         data.force[learned].astype(np.float64),
@@ -123,19 +120,15 @@ def bundles_bounds(path: Path, shots: int) -> dict[str, Any]:
         some = np.random.default_rng([0, specimen]).permutation(presses)[:shots]
         if shots >= len(presses):
             continue
-        learned = np.isin(data.group[own], some)
-        columns: dict[str, Any] = {
-            name: values[own[learned]] for name, values in data.arrays().items()
-        }
-        columns["sensor"] = np.zeros(learned.sum(), np.int32)
+        learned, others = dealt(data, own, some)
+        columns: dict[str, Any] = {name: values[learned] for name, values in data.arrays().items()}
+        columns["sensor"] = np.zeros(len(learned), np.int32)
         with tempfile.TemporaryDirectory() as scratch:
             folder = Path(scratch) / "bundle"
             known = replace(data, **columns, sensor_names=(data.sensor_names[specimen],))
             train_finger(known, folder, name="features-one")
             formulas = read_bundle(folder).manifest.intervals
             session = InferenceSession((folder / "model.onnx").read_bytes())
-        others = own[~learned]
-        others = others[np.linalg.norm(data.force[others], axis=1) >= PRESS_N]
         given = session.run(None, {"electrodes": data.tared_counts[others]})
         answers = dict(zip([one.name for one in session.get_outputs()], given, strict=True))
         size = np.linalg.norm(answers["force"].astype(np.float64), axis=1)
@@ -167,13 +160,19 @@ def pressed(data: FeatureDataset, own: NDArray[np.integer]) -> NDArray[np.intege
     return np.unique(data.group[own][size >= PRESS_N])
 
 
+def dealt(
+    data: FeatureDataset, own: NDArray[np.integer], presses: Any
+) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+    """A specimen's rows of some presses, to learn from, and the touched ones of its others."""
+    known = np.isin(data.group[own], presses)
+    touched = np.linalg.norm(data.force[own], axis=1) >= PRESS_N
+    return own[known], own[~known & touched]
+
+
 def real(finger: Finger, seconds: int) -> dict[str, Any]:
     """A real finger from its own first seconds, tested on all that comes later."""
     force, tared = finger.recording.force, finger.tared.astype(np.float64)
-    first = np.unique(np.linspace(0, seconds * HZ - 1, ROWS_MOST).astype(int))
-    later = np.arange((seconds + 1) * HZ, len(force))
-    known = KnownRows(tared[first], force[first], first // round(PRESS_S * HZ))
-    rest = finger.recording.baseline.mean(axis=0, dtype=np.float64)
+    known, rest, later = first_seconds(finger, seconds, most=ROWS_MOST)
     found = measured(known, rest, tared[later], force[later])
     return found | {"finger": finger.name, "seconds": seconds}
 
@@ -187,12 +186,12 @@ def page(facts: dict[str, Any]) -> str:
             some = [one for one in cells if one["shots"] == shots]
             if not some:
                 continue
-            right = np.mean([one["chosen"] == names[-1] for one in some])
+            right = np.mean([one["chosen"] == TOLD for one in some])
             rows.append(
                 [f"{SETS[key]}, {shots} presses", str(len({one["specimen"] for one in some})),
                  *(f"{mean(some, name, 'magnitude_n'):.3f} N,"
                    f" {mean(some, name, 'from_2n_percent'):.0f} %" for name in names),
-                 f"{100.0 * right:.0f} %", f"{mean(some, names[-1], 'location_mm'):.2f} mm"]
+                 f"{100.0 * right:.0f} %", f"{mean(some, TOLD, 'location_mm'):.2f} mm"]
             )  # fmt: skip
     real_rows = [
         [f"{one['finger']}, {one['seconds']} s",

@@ -25,15 +25,15 @@ from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.ingest import ingest_lasa
 from palpate_training.evaluation.transfer import (
     FIGURES,
-    PRESS_S,
     Finger,
     baselines_of,
     fingers_of,
+    first_seconds,
     run_transfer,
     summary,
 )
 from palpate_training.figures.style import markdown_table, new_figure, save
-from palpate_training.learning.force_process import ForceLine, KnownRows
+from palpate_training.learning.force_process import ForceLine
 from palpate_training.learning.twin_line import read_line
 from palpate_training.systems.transfer import ForceTransfer
 from palpate_training.tasks.finger import ROWS_MOST, estimate_of, fit_finger
@@ -43,11 +43,9 @@ Floats = NDArray[np.float64]
 OUT = Path(__file__).parent / "results" / "transfer"
 SHOTS = (0, 1, 5, 10, 20)
 OWN_S = (30, 60, 120)
-GUARD_S = 1
 LEARNED = 0.8
 """Share of a recording that is learned from, where its end is tested."""
 
-HZ = 100
 CONSOLE = Console()
 RIVALS = ("ridge", "constant")
 
@@ -96,10 +94,7 @@ def measure(fingers: list[Finger], **options: Any) -> list[dict[str, Any]]:
 def own(finger: Finger, seconds: int) -> dict[str, Any]:
     """A finger from its own first seconds, tested on all that comes later."""
     force, tared = finger.recording.force, finger.tared.astype(np.float64)
-    first = np.unique(np.linspace(0, seconds * HZ - 1, ROWS_MOST).astype(int))
-    later = np.arange((seconds + GUARD_S) * HZ, len(force))
-    known = KnownRows(tared[first], force[first], first // round(PRESS_S * HZ))
-    rest = finger.recording.baseline.mean(axis=0, dtype=np.float64)
+    known, rest, later = first_seconds(finger, seconds, most=ROWS_MOST)
     estimator, net = fit_finger(known, rest)
     constant = np.tile(known.force.mean(axis=0), (len(later), 1))
     return {

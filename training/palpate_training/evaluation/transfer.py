@@ -22,6 +22,7 @@ from palpate.errors import DatasetError
 from palpate_training.datasets.container import add_array
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.learning.baselines import ridge
+from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.metrics import force_errors
 from palpate_training.learning.twin_line import TwinLine
 from palpate_training.systems.transfer import (
@@ -98,6 +99,26 @@ def _finger(data: FeatureDataset, sensor: int) -> Finger:
         data.force[rows].astype(np.float64),
     )
     return Finger(data.sensor_names[sensor], recording, data.tared_counts[rows])
+
+
+def first_seconds(finger: Finger, seconds: float, *, most: int) -> tuple[KnownRows, Floats, Rows]:
+    """What a finger could learn from its own first seconds, as if it had been calibrated then.
+
+    Args:
+        finger: The finger.
+        seconds: How many.
+        most: Rows, evenly over them, at most.
+
+    Returns:
+        These rows, in presses of ``PRESS_S``; the finger's untouched counts, shape (19,); and the
+        numbers of all rows from ``GUARD_S`` later on.
+    """
+    per_s = round(1.0 / finger.recording.period_s)
+    force, tared = finger.recording.force, finger.tared.astype(np.float64)
+    first = np.unique(np.linspace(0, seconds * per_s - 1, most).astype(int))
+    known = KnownRows(tared[first], force[first], first // round(PRESS_S * per_s))
+    rest = finger.recording.baseline.mean(axis=0, dtype=np.float64)
+    return known, rest, np.arange(round((seconds + GUARD_S) * per_s), len(force))
 
 
 def run_transfer(
