@@ -20,6 +20,7 @@ train_app.command("all")(train.train_all)
 train_app.command("report")(report.train_report)
 train_app.command("upgrade")(train.train_upgrade)
 train_app.command("intervals")(train.train_intervals)
+train_app.command("evaluate")(report.train_evaluate)
 
 data_app = typer.Typer(
     no_args_is_help=True, help="Make data sets and look into them.", rich_markup_mode=None

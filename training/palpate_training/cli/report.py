@@ -1,13 +1,15 @@
-"""``palpate train report``: every system on every split of a data set, as one page."""
+"""``palpate train report`` and ``evaluate``: what systems, or one bundle, are worth on data."""
 
 from __future__ import annotations
 
 import json
 import os
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -17,15 +19,21 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 
 from palpate.errors import ConfigError, DatasetError
+from palpate.files.atomic import written_whole
 from palpate.process import typed_command
 
 if TYPE_CHECKING:
     from palpate_training.evaluation.cells import Cell
     from palpate_training.evaluation.study import Study, StudySource
+    from palpate_training.tasks.evaluate import Evaluation
 
 console = Console()
+
+SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0)}
+"""What people read instead of an SI unit, and the factor to it."""
 
 
 def _words(text: str) -> tuple[str, ...]:
@@ -107,6 +115,73 @@ def train_report(
     read = json.loads((out / "study.json").read_text(encoding="utf-8"))
     for path in (out / "study.json", *write_pages(out, read, command=typed_command())):
         console.print(f"wrote {path}", soft_wrap=True)
+
+
+def train_evaluate(
+    bundle: Annotated[Path, typer.Argument(help="Folder of a bundle.")],
+    data: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Data sets (.h5) whose truth is known: of features or mixed for a features "
+            "bundle, mixed for others."
+        ),
+    ],
+    unit: Annotated[
+        str | None,
+        typer.Option(help="Rows of this specimen or sensor alone; needed for synthesis."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="JSON file to write, in SI units; must not exist.")
+    ] = None,
+) -> None:
+    """Errors of a bundle on data sets, by force, with confidence intervals over presses.
+
+    palpate train evaluate models/features-twin/9 runs/test/mixed.h5
+    """
+    from palpate_training.tasks.evaluate import evaluate
+
+    if out is not None and out.exists():
+        raise ConfigError(f"{out} exists", remedy="name another file with --out")
+    found = evaluate(bundle, data, unit=unit)
+    console.print(_table(found))
+    if found.trained_on:
+        console.print(
+            "[bold]It was trained on one of these data sets:[/bold] most of these rows are known to"
+            " it. Take presses that no training has seen."
+        )
+    if out is not None:
+        with written_whole(out) as part:
+            part.write_text(json.dumps(found.as_dict(), indent=1) + "\n", encoding="utf-8")
+        console.print(f"wrote {out}", soft_wrap=True)
+
+
+def _table(found: Evaluation) -> Table:
+    """Errors by force, one quantity after the other."""
+    from palpate_training.tasks.evaluate import KINDS
+
+    table = Table(
+        title=f"{found.bundle}: {found.rows} rows of {found.presses} presses",
+        caption="constant: the mean of these rows, or nothing for fields and electrodes",
+        box=SIMPLE,
+    )
+    for column in ("error", "of rows", "", "95 % over presses", "constant"):
+        table.add_column(column, justify="left" if column in ("error", "of rows") else "right")
+    for name in dict.fromkeys(one.name for one in found.figures):
+        kind = KINDS[name]
+        unit, factor = SHOWN.get(kind.unit, (kind.unit, 1.0))
+        heads = [name.replace("_", " "), f"({kind.statistic}, {unit})"]
+        rows = [one for one in found.figures if one.name == name]
+        for one, head in zip_longest(rows, heads[: len(rows)], fillvalue=""):
+            assert not isinstance(one, str)
+            table.add_row(
+                head,
+                one.where.replace("_", " ").replace("2n", "2 N").replace("8n", "8 N"),
+                f"{factor * one.value:.3g}",
+                f"{factor * one.low:.3g} to {factor * one.high:.3g}",
+                f"{factor * one.constant:.3g}",
+                end_section=one is rows[-1],
+            )
+    return table
 
 
 def make_with_progress(study: Study, folder: Path, workers: int, device: str) -> None:

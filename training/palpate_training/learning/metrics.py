@@ -17,6 +17,7 @@ Rows of one block are nearly copies, so confidence intervals resample whole bloc
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ from palpate.messages import COUNTS_MAX
 
 Float = npt.NDArray[np.floating]
 Labels = npt.NDArray[np.int32]
+Number = TypeVar("Number", bound=np.floating)
 Statistic = Callable[[npt.NDArray[np.float64]], float]
 
 FORCE_BINS_N = {"below_2n": (0.0, 2.0), "2_to_8n": (2.0, 8.0), "above_8n": (8.0, np.inf)}
@@ -254,8 +256,8 @@ def field_errors(estimate: Float, truth: Float, subset: Indices) -> dict[str, Ro
     }
 
 
-def join(parts: Iterable[dict[str, Rows64]]) -> dict[str, Rows64]:
-    """Errors of rows that were computed part by part."""
+def join(parts: Iterable[dict[str, npt.NDArray[Number]]]) -> dict[str, npt.NDArray[Number]]:
+    """Arrays of the same names that were computed part by part."""
     listed = list(parts)
     return {name: np.concatenate([part[name] for part in listed]) for name in listed[0]}
 

@@ -1,0 +1,114 @@
+"""Write docs/results/shipped.md and shipped.json: errors of the shipped bundles on new presses.
+
+``python docs/make_shipped.py runs``    or without a folder: the page alone, from the JSON file
+
+``runs`` holds experiments on the specimens that ship, at points that no training has seen: the page
+says the commands. Half a minute on two cores.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from palpate_services.inference.repository import resolve
+from palpate_training.figures.style import markdown_table
+from palpate_training.tasks.evaluate import evaluate
+
+PAGE = Path(__file__).parent / "results" / "shipped.md"
+RESULTS = PAGE.with_suffix(".json")
+
+RUNS = ("calibrate", "check", "test")
+BUNDLES = {"features-twin": None, "field-twin": None, "synthesis-twin": "biotac-2"}
+"""By the specimen whose rows are taken; None = all three."""
+
+HEADS = {
+    "all": "of all",
+    "below_2n": "below 2 N",
+    "2_to_8n": "2 to 8 N",
+    "above_8n": "above 8 N",
+    "from_2n": "from 2 N",
+}
+SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0)}
+WORDS = {
+    "force_magnitude": "force",
+    "force_magnitude_over_norm": "force, over the true one",
+    "force_angle": "its angle",
+    "contact_location": "contact location",
+    "centre_of_pressure": "centre of pressure",
+    "contact_normal": "contact normal",
+    "displacement_128_nodes": "skin, the paper's 128 nodes",
+    "displacement": "skin, all 6,870 nodes",
+    "contact_force_misplaced": "contact forces on other nodes or turned, spread over 1.5 mm",
+    "electrodes": "electrodes of `biotac-2` from the skin",
+}
+PAPER = {
+    "force_magnitude": "0.64",
+    "contact_location": "2.0",
+    "displacement_128_nodes": "0.22",
+    "electrodes": "66 to 80",
+}
+"""The paper's best on its own, real or finite-element, data."""
+
+
+def main() -> None:
+    """Measure if experiments are named, and write the page."""
+    if len(sys.argv) > 1:
+        sets = [Path(sys.argv[1]) / run / "mixed.h5" for run in RUNS]
+        found = [
+            evaluate(resolve(name), sets, unit=unit).as_dict() for name, unit in BUNDLES.items()
+        ]
+        RESULTS.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    PAGE.write_text(page(json.loads(RESULTS.read_text(encoding="utf-8"))), encoding="utf-8")
+
+
+def page(found: list[dict[str, Any]]) -> str:
+    """The page."""
+    rows = []
+    for one in found:
+        at = {(figure["name"], figure["where"]): figure for figure in one["figures"]}
+        for name in dict.fromkeys(figure["name"] for figure in one["figures"]):
+            figure = at[name, "all"]
+            unit, factor = SHOWN.get(figure["unit"], (figure["unit"], 1.0))
+            low, high = (f"{factor * end:.3g}" for end in figure["ci95"])
+            rows.append(
+                [
+                    one["bundle"],
+                    f"{WORDS[name]} [{unit}]",
+                    figure["statistic"],
+                    *(f"{factor * at[name, where]['value']:.3g}" for where in HEADS),
+                    f"{low} to {high}",
+                    f"{factor * figure['constant']:.3g}",
+                    PAPER.get(name, ""),
+                ]
+            )
+    first = found[0]
+    table = markdown_table(
+        ["bundle", "error", "", *HEADS.values(), "95 %, of all", "constant", "paper"], rows, words=3
+    )
+    return f"""# Errors of the bundles that ship
+
+Made by `python docs/make_shipped.py runs`, on presses at points that no training has seen, on the
+three specimens that ship: {first["presses"]} presses, {first["rows"]} rows above 0.5 N, simulated
+fingers only. The same for any bundle and data set: `palpate train evaluate BUNDLE DATA`.
+
+<!-- run by: tests/deploy/test_generate.py -->
+```sh
+palpate data generate runs/calibrate --points 3 --angled 2 --seed 11
+palpate data generate runs/check --points 2 --angled 2 --seed 12
+palpate data generate runs/test --points 2 --angled 2 --seed 13
+```
+
+Columns are of rows with such a force. The 95 % interval is over presses; the constant is the mean
+of these rows, or nothing for skin and electrodes; the paper's is its best, on real sensors (of the
+skin: on its own simulations). The bounds of the first two bundles were learned from `calibrate` and
+`check`, weights from none of these. What each bundle does on presses that its own training held
+out, of all kinds, is on [its card](../models.md). [How they were trained](../twin.md#networks).
+
+{table}"""
+
+
+if __name__ == "__main__":
+    main()

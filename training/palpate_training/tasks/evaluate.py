@@ -1,0 +1,391 @@
+"""Errors of a bundle on a data set: of any bundle, on any rows whose truth is known.
+
+What a manifest reports was measured once, on presses that were drawn from those of the training.
+Here the same weights answer rows of another experiment, or of another sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from palpate.errors import DatasetError
+from palpate.files.bundle import Bundle, read_bundle
+from palpate.files.hdf5 import schema_of
+from palpate_training.datasets.experiment import (
+    ExperimentDataset,
+    MixedDataset,
+    content_sha256,
+    read_mixed,
+)
+from palpate_training.datasets.export import features
+from palpate_training.datasets.features import (
+    FEATURES_SCHEMA,
+    OF_CONTACT,
+    FeatureDataset,
+    FloatArray,
+    open_dataset,
+)
+from palpate_training.learning.contact_code import spread_forces_in_parts
+from palpate_training.learning.export import session_of
+from palpate_training.learning.field_code import in_parts
+from palpate_training.learning.metrics import (
+    FORCE_BINS_N,
+    Labels,
+    Statistic,
+    angles,
+    cluster_bootstrap,
+    contact_errors,
+    electrode_errors,
+    field_errors,
+    force_errors,
+    join,
+    root_mean,
+)
+from palpate_training.learning.splits import Rows
+from palpate_training.tasks.features import NORMAL
+from palpate_training.tasks.fields import tared_counts
+
+Floats = npt.NDArray[np.float64]
+
+BINS_N = {"all": (0.0, np.inf), **FORCE_BINS_N, "from_2n": (2.0, np.inf)}
+"""The force [N] of the rows that a figure is of."""
+
+DRAWS = 500
+"""Of whole presses, for a confidence interval."""
+
+
+class _Kind(NamedTuple):
+    """Unit of an error, and the number that is made of those of many rows."""
+
+    unit: str
+    statistic: str
+    of: Statistic
+
+
+def _median(values: Floats) -> float:
+    return float(np.nanmedian(values)) if np.isfinite(values).any() else float("nan")
+
+
+def _mean(values: Floats) -> float:
+    return float(np.mean(values))
+
+
+KINDS = {
+    "force_magnitude": _Kind("N", "median", _median),
+    "force_magnitude_over_norm": _Kind("1", "median", _median),
+    "force_angle": _Kind("rad", "median", _median),
+    "contact_location": _Kind("m", "median", _median),
+    "centre_of_pressure": _Kind("m", "median", _median),
+    NORMAL: _Kind("rad", "median", _median),
+    "displacement_128_nodes": _Kind("m", "mean", _mean),
+    "displacement": _Kind("m", "mean", _mean),
+    "contact_force_misplaced": _Kind("1", "median", _median),
+    "electrodes": _Kind("counts", "root mean square", root_mean),
+}
+"""By the name of the error; ``learning.metrics`` defines them. ``displacement`` is the mean over
+all nodes, ``contact_force_misplaced`` the share of the force that is on other nodes or turned."""
+
+
+class Figure(NamedTuple):
+    """One error of a bundle.
+
+    Attributes:
+        name: What of, in ``KINDS``.
+        where: Force of the rows, in ``BINS_N``.
+        rows: How many.
+        presses: Of how many presses.
+        value: The error; NaN if no row has it.
+        low: Lower end of its 95 % confidence interval, presses drawn with replacement.
+        high: Upper end.
+        constant: The same of the best-known constant: the mean of these rows for what features are,
+            nothing for fields and electrodes.
+    """
+
+    name: str
+    where: str
+    rows: int
+    presses: int
+    value: float
+    low: float
+    high: float
+    constant: float
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """What a bundle makes of data sets.
+
+    Attributes:
+        bundle: Name and version.
+        sha256: Digest of the bundle, hex.
+        task: Of the bundle.
+        data: Source and digest (hex) of each data set.
+        rows: Of all data sets, those that are not in contact left out.
+        presses: Which these rows are of.
+        figures: By name and force.
+        trained_on: Whether a data set is the one that the bundle was trained on.
+    """
+
+    bundle: str
+    sha256: str
+    task: str
+    data: tuple[tuple[str, str], ...]
+    rows: int
+    presses: int
+    figures: tuple[Figure, ...]
+    trained_on: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """For a JSON file: SI units, None where a number is not known."""
+
+        def number(value: float) -> float | None:
+            return float(f"{value:.5g}") if np.isfinite(value) else None
+
+        return {
+            "schema": "palpate.evaluation 1",
+            "bundle": self.bundle,
+            "sha256": self.sha256,
+            "task": self.task,
+            "data": [{"source": source, "sha256": digest} for source, digest in self.data],
+            "trained_on": self.trained_on,
+            "rows": self.rows,
+            "presses": self.presses,
+            "figures": [
+                {
+                    "name": one.name,
+                    "unit": KINDS[one.name].unit,
+                    "statistic": KINDS[one.name].statistic,
+                    "where": one.where,
+                    "rows": one.rows,
+                    "presses": one.presses,
+                    "value": number(one.value),
+                    "ci95": [number(one.low), number(one.high)],
+                    "constant": number(one.constant),
+                }
+                for one in self.figures
+            ],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class _Errors:
+    """Errors of every row by name, of the bundle and of a constant; force [N] and press of each."""
+
+    found: Mapping[str, Floats]
+    constant: Mapping[str, Floats]
+    force_n: Floats
+    press: Labels
+
+
+def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) -> Evaluation:
+    """Errors of a bundle on the rows in contact of data sets, by the force of the row.
+
+    Args:
+        folder: Of the bundle.
+        paths: Data sets: of features or mixed for the task ``features``, mixed for the others.
+        unit: Rows of this specimen or sensor alone; for the task ``synthesis`` it must be given.
+
+    Raises:
+        BundleError: The bundle breaks its contract.
+        DatasetError: A data set breaks its schema, has no such rows, or no unit is given.
+    """
+    bundle = read_bundle(folder)
+    manifest = bundle.manifest
+    if manifest.task == "synthesis" and unit is None:
+        raise DatasetError(
+            f"{folder} synthesises the electrodes of one specimen",
+            remedy="say which with --unit; its model card does",
+        )
+    about: list[tuple[str, str]] = []
+    parts: list[_Errors] = []
+    for path in paths:
+        if manifest.task == "features":
+            data, source, digest = _features(path)
+            parts.append(_of_features(bundle, data, _rows_of_sensor(data, unit, path)))
+        else:
+            mixed = read_mixed(path)
+            experiment = mixed.experiment
+            source, digest = experiment.provenance.source, content_sha256(mixed)
+            rows = _rows_of_unit(experiment, unit, path)
+            of = _of_field if manifest.task == "field" else _of_synthesis
+            parts.append(of(bundle, mixed, rows))
+        about.append((source, digest))
+    errors = _joined(parts)
+    return Evaluation(
+        bundle=f"{manifest.name} {manifest.version}",
+        sha256=bundle.sha256.hex(),
+        task=manifest.task,
+        data=tuple(about),
+        rows=len(errors.press),
+        presses=len(np.unique(errors.press)),
+        figures=tuple(_figures(errors)),
+        trained_on=manifest.training_data_sha256 in {digest for _, digest in about},
+    )
+
+
+def _features(path: Path) -> tuple[FeatureDataset, str, str]:
+    """Rows of features of a file, its source and its digest."""
+    if schema_of(path, extra="training") == FEATURES_SCHEMA.name:
+        data = open_dataset(path)
+        return data, data.provenance.source, data.content_sha256()
+    mixed = read_mixed(path)
+    return features(mixed), mixed.experiment.provenance.source, content_sha256(mixed)
+
+
+def _rows_of_sensor(data: FeatureDataset, unit: str | None, path: Path) -> Rows:
+    kept = np.ones(len(data), bool) if data.in_contact is None else data.in_contact
+    if unit is not None:
+        kept = kept & np.isin(data.sensor, _number(unit, data.sensor_names, path))
+    return _some(np.flatnonzero(kept), path)
+
+
+def _rows_of_unit(data: ExperimentDataset, unit: str | None, path: Path) -> Rows:
+    if unit is None:
+        return np.arange(len(data.trial))
+    number = _number(unit, data.unit_names, path)
+    return _some(np.flatnonzero(np.isin(data.trial_unit[data.trial], number)), path)
+
+
+def _number(unit: str, names: Sequence[str], path: Path) -> int:
+    if unit not in names:
+        raise DatasetError(
+            f"{path}: no {unit!r} in it", remedy=f"it holds {', '.join(names)}: take one of these"
+        )
+    return list(names).index(unit)
+
+
+def _some(rows: Rows, path: Path) -> Rows:
+    if not len(rows):
+        raise DatasetError(f"{path}: no row is in contact", remedy="take a data set with presses")
+    return rows
+
+
+def _of_features(bundle: Bundle, data: FeatureDataset, rows: Rows) -> _Errors:
+    tared, truth = data.tared_counts[rows], data.force[rows]
+    answers = join(_answers(bundle, lambda part: tared[part], np.arange(len(rows))))
+
+    def errors(given: Callable[[str, FloatArray], FloatArray]) -> dict[str, Floats]:
+        force = force_errors(given("force", truth), truth)
+        found = {
+            "force_magnitude": force["magnitude_n"],
+            "force_magnitude_over_norm": force["magnitude_over_norm"],
+            "force_angle": force["angle_rad"],
+        }
+        for name in OF_CONTACT:
+            wanted = getattr(data, name)
+            if wanted is not None and name in answers:
+                wanted = wanted[rows]
+                estimate = given(name, wanted)
+                found[name] = (
+                    angles(estimate, wanted)
+                    if name == NORMAL
+                    else np.linalg.norm(estimate.astype(np.float64) - wanted, axis=1)
+                )
+        return found
+
+    press = data.group if len(np.unique(data.group)) > 1 else data.block
+    return _Errors(
+        errors(lambda name, _: answers[name]),
+        errors(_mean_of_rows),
+        np.linalg.norm(truth.astype(np.float64), axis=1),
+        press[rows],
+    )
+
+
+def _mean_of_rows(_: str, wanted: FloatArray) -> FloatArray:
+    return np.broadcast_to(np.nanmean(wanted, axis=0, dtype=np.float32), wanted.shape)
+
+
+def _of_field(bundle: Bundle, data: MixedDataset, rows: Rows) -> _Errors:
+    tared = tared_counts(data)
+    found: list[dict[str, Floats]] = []
+    constant: list[dict[str, Floats]] = []
+    subset, nodes = data.mesh.subset, data.mesh.nodes
+    outputs = [tensor.name for tensor in bundle.manifest.outputs]
+    known = "contact_force" in outputs and data.contact is not None
+    forces = spread_forces_in_parts(data, rows) if known else None
+    for part, answers in zip(
+        in_parts(rows), _answers(bundle, lambda part: tared[part], rows), strict=True
+    ):
+        truth = data.displacement(part)
+        each = {
+            "net": answers["displacement"].reshape(-1, *nodes.shape),
+            "none": np.zeros_like(truth),
+        }
+        for name, into in (("net", found), ("none", constant)):
+            errors = field_errors(each[name], truth, subset)
+            into.append(
+                {"displacement_128_nodes": errors["subset_m"], "displacement": errors["all_m"]}
+            )
+        if forces is not None:
+            wanted = next(forces)
+            estimate = answers["contact_force"].reshape(len(part), -1, 3)[:, data.mesh.outer_nodes]
+            for force, into in ((estimate, found), (np.zeros_like(wanted), constant)):
+                into[-1]["contact_force_misplaced"] = contact_errors(force, wanted)["misplaced"]
+    return _Errors(join(found), join(constant), *_force_and_press(data.experiment, rows))
+
+
+def _of_synthesis(bundle: Bundle, data: MixedDataset, rows: Rows) -> _Errors:
+    truth = tared_counts(data)[rows]
+    answers = join(
+        _answers(bundle, lambda part: data.displacement(part).reshape(len(part), -1), rows)
+    )
+    found, constant = (
+        {"electrodes": electrode_errors(estimate, truth)["mean_square"]}
+        for estimate in (answers["tared_counts"], np.zeros_like(truth))
+    )
+    return _Errors(found, constant, *_force_and_press(data.experiment, rows))
+
+
+def _force_and_press(data: ExperimentDataset, rows: Rows) -> tuple[Floats, Labels]:
+    return np.linalg.norm(data.force[rows].astype(np.float64), axis=1), data.row_trajectory[rows]
+
+
+def _answers(
+    bundle: Bundle, inputs: Callable[[Rows], FloatArray], rows: Rows
+) -> Iterator[dict[str, FloatArray]]:
+    """Outputs of a bundle's model by name, for each part of the rows."""
+    session = session_of(bundle.model)
+    names = [tensor.name for tensor in bundle.manifest.outputs]
+    (given,) = bundle.manifest.inputs
+    for part in in_parts(rows):
+        found = session.run(names, {given.name: np.asarray(inputs(part), np.float32)})
+        yield dict(zip(names, found, strict=True))
+
+
+def _joined(parts: Sequence[_Errors]) -> _Errors:
+    """Rows of all data sets; a quantity that one of them does not know is left out."""
+    first = np.cumsum([0, *(int(part.press.max()) + 1 for part in parts)])
+    names = [name for name in parts[0].found if all(name in part.found for part in parts)]
+    return _Errors(
+        {name: np.concatenate([part.found[name] for part in parts]) for name in names},
+        {name: np.concatenate([part.constant[name] for part in parts]) for name in names},
+        np.concatenate([part.force_n for part in parts]),
+        np.concatenate([part.press + start for part, start in zip(parts, first, strict=False)]),
+    )
+
+
+def _figures(errors: _Errors) -> Iterator[Figure]:
+    for where, (low, high) in BINS_N.items():
+        rows = np.flatnonzero((errors.force_n >= low) & (errors.force_n < high))
+        if not len(rows):
+            continue
+        press = errors.press[rows]
+        for name, found in errors.found.items():
+            statistic = KINDS[name].of
+            ends = cluster_bootstrap({name: found[rows]}, press, statistic=statistic, draws=DRAWS)
+            yield Figure(
+                name,
+                where,
+                len(rows),
+                len(np.unique(press)),
+                statistic(found[rows]),
+                *ends[name],
+                statistic(errors.constant[name][rows]),
+            )
