@@ -62,6 +62,11 @@ def _as(frame: ElectrodeFrame, serial: str, tared: FloatArray, tare: Tare) -> El
     return dataclasses.replace(frame, sensor_serial=serial, electrodes=counts)
 
 
+def _own_serial(name: str) -> str:
+    """A sensor that the bundle was made for."""
+    return read_bundle(resolve(name)).manifest.sensor_serials[0].replace("*", "9")
+
+
 def _answer(tare: Tare, _: TareRequest) -> Tare:
     return tare
 
@@ -77,7 +82,10 @@ def test_every_estimate_of_a_real_sensor_says_that_it_is_uncalibrated(
         _served(link, name, until) as session,
         Client(link.connect[0], station="lab", timeout_s=20.0) as client,
     ):
-        for sensor, serial, real in (("finger", "BT000123", True), ("virtual", "VIRTUAL-9", False)):
+        for sensor, serial, real in (
+            ("finger", "BT000123", True),
+            ("virtual", _own_serial(name), False),
+        ):
             own = dataclasses.replace(tare, sensor_serial=serial)
             session.queryable(endpoints.TARE, partial(_answer, own), sensor=sensor)
             session.publisher(TARE, sensor=sensor).put(own)
@@ -100,6 +108,17 @@ def test_every_estimate_of_a_real_sensor_says_that_it_is_uncalibrated(
                 assert (int(UNCALIBRATED) in list(ros.fields["quality"])) is real
 
 
+def test_a_drawn_specimen_is_another_sensor_than_the_three_that_ship(
+    make_frame: Frames, make_tare: Tares
+) -> None:
+    runtime = load(read_bundle(resolve("features-twin")), "features")
+    for serial, known in (("VIRTUAL-biotac-2-S7", True), ("VIRTUAL-unit-001-S7", False)):
+        tare = dataclasses.replace(make_tare(), sensor_serial=serial)
+        answer = estimate(dataclasses.replace(make_frame(1), sensor_serial=serial), tare, runtime)
+        assert isinstance(answer, FeatureEstimate)
+        assert (UNCALIBRATED not in answer.quality) is known
+
+
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_bound_of_another_sensor_is_no_narrower(
     make_frame: Frames, make_tare: Tares, name: str
@@ -111,7 +130,7 @@ def test_a_bound_of_another_sensor_is_no_narrower(
     rows = read_bundle(resolve(name)).golden["electrodes"]
     for row in rows:
         found = []
-        for serial in ("VIRTUAL-9", "BT000123"):
+        for serial in (_own_serial(name), "BT000123"):
             frame = _as(make_frame(1), serial, row, tare)
             answer = estimate(frame, dataclasses.replace(tare, sensor_serial=serial), runtime)
             assert isinstance(answer, FeatureEstimate)
