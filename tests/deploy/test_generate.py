@@ -28,7 +28,6 @@ from palpate_fem.store.read import SimulationStore
 from palpate_training.datasets.experiment import read_experiment, read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import joined
-from palpate_training.experiment.generate.fingertips import share_out
 from palpate_training.experiment.generate.pipeline import (
     EXPERIMENT,
     MIXED,
@@ -39,7 +38,7 @@ from palpate_training.experiment.generate.pipeline import (
     provenance_sha256,
 )
 from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
-from palpate_training.experiment.generate.simulator import ExperimentSpec, Specimen
+from palpate_training.experiment.generate.simulator import ExperimentSpec, Specimen, share_out
 from palpate_training.experiment.generate.workers import WorkerProcesses
 
 SPEC = ExperimentSpec(

@@ -195,10 +195,14 @@ def data_generate(
     from palpate_fem.indenter.path import parse_segments, show_segments
     from palpate_fem.population.fingertips import draw_fingertips
     from palpate_fem.service.device_process import check_places
-    from palpate_training.experiment.generate.fingertips import FingertipShare, share_out
     from palpate_training.experiment.generate.pipeline import MIXED, is_finished
     from palpate_training.experiment.generate.pipeline import generate as run
-    from palpate_training.experiment.generate.simulator import FLUID_VOLUME_M3, ExperimentSpec
+    from palpate_training.experiment.generate.simulator import (
+        FLUID_VOLUME_M3,
+        ExperimentSpec,
+        FingertipShare,
+        share_out,
+    )
 
     check_places(device or (), slots, ray)
     fill_m3 = FLUID_VOLUME_M3 if fill_ml is None else fill_ml * 1e-6

@@ -20,7 +20,7 @@ from palpate_training.datasets.export import features
 from palpate_training.datasets.features import write_dataset
 from palpate_training.learning.features_net import FeaturesNetConfig
 from palpate_training.learning.splits import by_trajectory, of_units
-from palpate_training.tasks.evaluate import Evaluation, Figure, evaluate
+from palpate_training.tasks.evaluate import BundleErrors, Figure, evaluate
 from palpate_training.tasks.features import train_features
 from palpate_training.tasks.fields import FieldFitConfig, field_bundle
 from palpate_training.tasks.synthesis import synthesis_bundle
@@ -30,7 +30,7 @@ pytest.importorskip("onnx")
 UNIT = "biotac-2"
 
 
-def figure(found: Evaluation, name: str, where: str = "all") -> Figure:
+def figure(found: BundleErrors, name: str, where: str = "all") -> Figure:
     (one,) = (one for one in found.figures if (one.name, one.where) == (name, where))
     return one
 
@@ -57,6 +57,10 @@ def test_a_field_bundle_is_as_good_as_it_says(
     assert nodes.constant == pytest.approx(metrics["zero_nodal_subset_m"], rel=1e-2)
     assert found.sha256 == read_bundle(tmp_path / "field").sha256.hex()
     assert not found.trained_on
+    other = replace(mixed, mesh=replace(mixed.mesh, sha256="cd" * 32))
+    write_mixed(tmp_path / "other.h5", other)
+    with pytest.raises(DatasetError, match="has the mesh cdcdcdcdcdcd"):
+        evaluate(tmp_path / "field", [tmp_path / "other.h5"])
     for where in ("below_2n", "2_to_8n", "above_8n"):
         if f"nodal_all_m_{where}" in metrics:
             value = figure(found, "displacement", where).value

@@ -36,7 +36,7 @@ def test_two_experiments_make_bundles_that_are_tested_on_a_third(
     rows = tmp_path / "features.h5"
     run(data_app, "features", first, more, rows)
     features = tmp_path / "features"
-    out = ["--data", rows, "--out", features, "--name", "features-twin"]
+    out = ["--data", str(rows), "--out", str(features), "--name", "features-twin"]
     run(train_app, "features", *out, *serial, *quick)
     bounded = tmp_path / "features-twin" / "9"
     run(train_app, "intervals", features, bounded, "--held-out", held)

@@ -28,7 +28,7 @@ from palpate.process import typed_command
 if TYPE_CHECKING:
     from palpate_training.evaluation.cells import Cell
     from palpate_training.evaluation.study import Study, StudySource
-    from palpate_training.tasks.evaluate import Evaluation
+    from palpate_training.tasks.evaluate import BundleErrors
 
 console = Console()
 
@@ -155,7 +155,7 @@ def train_evaluate(
         console.print(f"wrote {out}", soft_wrap=True)
 
 
-def _table(found: Evaluation) -> Table:
+def _table(found: BundleErrors) -> Table:
     """Errors by force, one quantity after the other."""
     from palpate_training.tasks.evaluate import KINDS
 

@@ -118,7 +118,7 @@ class Figure(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Evaluation:
+class BundleErrors:
     """What a bundle makes of data sets.
 
     Attributes:
@@ -183,7 +183,7 @@ class _Errors:
     press: Labels
 
 
-def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) -> Evaluation:
+def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) -> BundleErrors:
     """Errors of a bundle on the rows in contact of data sets, by the force of the row.
 
     Args:
@@ -210,6 +210,7 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
             parts.append(_of_features(bundle, data, _rows_of_sensor(data, unit, path)))
         else:
             mixed = read_mixed(path)
+            _check_mesh(bundle, mixed, path)
             experiment = mixed.experiment
             source, digest = experiment.provenance.source, content_sha256(mixed)
             rows = _rows_of_unit(experiment, unit, path)
@@ -217,7 +218,7 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
             parts.append(of(bundle, mixed, rows))
         about.append((source, digest))
     errors = _joined(parts)
-    return Evaluation(
+    return BundleErrors(
         bundle=f"{manifest.name} {manifest.version}",
         sha256=bundle.sha256.hex(),
         task=manifest.task,
@@ -227,6 +228,15 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
         figures=tuple(_figures(errors)),
         trained_on=manifest.training_data_sha256 in {digest for _, digest in about},
     )
+
+
+def _check_mesh(bundle: Bundle, data: MixedDataset, path: Path) -> None:
+    if bundle.manifest.mesh_sha256 != data.mesh.sha256:
+        raise DatasetError(
+            f"{path} has the mesh {data.mesh.sha256[:12]}, {bundle.manifest.name} is for "
+            f"{bundle.manifest.mesh_sha256[:12]}",
+            remedy="take a data set of the mesh that the bundle was trained on",
+        )
 
 
 def _features(path: Path) -> tuple[FeatureDataset, str, str]:
