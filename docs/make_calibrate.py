@@ -52,6 +52,7 @@ Floats = NDArray[np.float64]
 
 OUT = Path(__file__).parent / "results" / "calibrate"
 SETS = {"calibrate": "the three that ship", "drawn": "drawn ones"}
+LIKE_PAPER = "like the paper's, at other points"  # as docs/make_shipped.py calls them
 SHOTS = (6, 10, 20)
 SPECIMENS_MOST = 8
 DRAWS = 3
@@ -210,6 +211,11 @@ def page(facts: dict[str, Any]) -> str:
     head = ["specimens", "number", *names, "the last is chosen", "its location"]
     twin = [one["unlike"] for cells in facts["simulated"].values() for one in cells]
     others = [one["unlike"] for one in facts["real"]]
+    shipped = json.loads((OUT.parent / "shipped.json").read_text(encoding="utf-8"))
+    own_n, own_m = (
+        next(one["value"] for one in shipped[LIKE_PAPER][0]["figures"] if one["name"] == name)
+        for name in ("force_magnitude", "contact_location")
+    )
     least, most, real_least, real_most = min(twin), max(twin), min(others), max(others)
     return f"""# What a finger learns from its own presses
 
@@ -228,8 +234,8 @@ Specimens of the twin, neither of which nor whose skin the [population's network
 met. Median error of the force on all presses that were not learned from, and from 2 N in percent of
 the force; means over specimens and {facts["draws"]} draws of the presses. A force/torque sensor
 does not tell where a finger is touched; the network does (median error of the contact location).
-`features-twin`, which was trained on the three that ship, has 0.074 N and 0.88 mm on
-[presses like these](intervals.md).
+`features-twin`, which was trained on the three that ship, has {own_n:.3f} N and
+{1e3 * own_m:.2f} mm on [presses like these](shipped.md).
 
 {markdown_table(head, rows)}
 How often the 90 % bounds of such a finger's bundle hold on its other presses, each press counting
