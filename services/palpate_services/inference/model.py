@@ -185,9 +185,10 @@ class _Pattern:
 
 _log = logging.getLogger(__name__)
 
-GOLDEN_TOLERANCE = 1e-5
-"""Allowed deviation from the golden outputs, relative to their largest magnitude: float32 rounding
-of another CPU's kernels stays an order of magnitude below it."""
+GOLDEN_TOLERANCE = 1e-4
+"""Allowed deviation from the golden outputs, relative to their largest magnitude. Float32 is up to
+5e-5 from float64 (`features-twin` 9, contact location: 0.6 um), and another processor's kernels may
+round in another way; on the one that exported it two runtimes differ by 7e-6."""
 
 BATCH_MOST = 8
 """Most samples in one run: a row of eight costs a quarter to a half of a single run, and the gain
