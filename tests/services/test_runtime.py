@@ -12,7 +12,7 @@ import pytest
 
 from palpate.errors import BundleError, MissingExtraError
 from palpate.files.bundle import Bundle, read_bundle
-from palpate_services.inference.model import Runtime, load
+from palpate_services.inference.model import GOLDEN_TOLERANCE, Runtime, load
 from palpate_services.inference.onnx_file import has_external_data
 from palpate_services.inference.repository import available, resolve
 
@@ -28,6 +28,20 @@ def test_good_bundle_answers_its_golden_vectors(bundle: Bundle) -> None:
         assert answer is not None
         for name, values in answer.items():
             np.testing.assert_allclose(values, bundle.golden[name][at], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", available())
+def test_shipped_bundles_leave_room_for_processors_that_round_otherwise(name: str) -> None:
+    shipped = read_bundle(resolve(name))
+    session = load(shipped, shipped.manifest.task)
+    takes = shipped.manifest.inputs[0].name
+    for at, sample in enumerate(shipped.golden[takes]):
+        answer = session.run(sample)
+        assert answer is not None
+        for output, values in answer.items():
+            largest = np.abs(shipped.golden[output]).max()
+            deviation = np.abs(values - shipped.golden[output][at]).max()
+            assert deviation <= 0.2 * GOLDEN_TOLERANCE * largest, (output, at)
 
 
 def test_answers_keep_their_memory(bundle: Bundle) -> None:
