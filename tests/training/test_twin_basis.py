@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.basis import Blocks, FieldFile, encode, fit_basis, loss
+from palpate_training.datasets import basis as basis_module
+from palpate_training.datasets.basis import (
+    LOSS_MEAN_M,
+    Blocks,
+    FieldFile,
+    encode,
+    fit_basis,
+    loss,
+)
 from palpate_training.datasets.experiment import FloatArray
 
 NODES = 30
@@ -42,6 +50,23 @@ def test_as_many_modes_as_the_loss_asks_for_and_no_more() -> None:
     assert len(fit_basis(in_blocks(data, 17), loss_mean=2e-5).modes) == 2
     flat = basis.modes.reshape(4, -1)
     np.testing.assert_allclose(flat @ flat.T, np.eye(4), atol=1e-5)
+
+
+def test_some_rows_say_how_many_modes_and_all_are_measured(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Rows that none of the few that were asked are like need modes of their own."""
+    whole = fields(300, [1e-3 * 0.7**k for k in range(40)])
+    blocks = in_blocks(whole, 37)
+    all_asked = fit_basis(blocks)
+    monkeypatch.setattr(basis_module, "_SOME_ROWS", 12)
+    few_asked = fit_basis(blocks)
+    assert len(all_asked.modes) <= len(few_asked.modes) <= 1.1 * len(all_asked.modes) + 1
+    assert few_asked.loss_mean < LOSS_MEAN_M
+    # Each 25th row is asked, and the others have modes that those have not.
+    odd = fields(300, [1e-3, 1e-4])
+    odd[::25] = odd[:1] * np.linspace(0.5, 1.0, 12, dtype=np.float32)[:, None, None]
+    assert fit_basis(in_blocks(odd, 37)).loss_mean < LOSS_MEAN_M
 
 
 def test_the_loss_is_what_the_stored_numbers_lose() -> None:

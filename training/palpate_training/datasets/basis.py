@@ -51,6 +51,9 @@ _LOSS_RATIO = 1.01
 _ROUNDING = 0.02
 """Mean square of what the first step tried moves a node by, over the squared mean loss."""
 
+_SOME_ROWS = 512
+"""Rows that say how many modes are about enough."""
+
 _ROWS = 200
 """Rows that a block read from disk has at least: products of few rows use half of a processor."""
 
@@ -136,25 +139,39 @@ def fit_basis(
             that float32 cannot reach.
     """
     mean, rows = _mean(blocks)
-    flat = mean.reshape(-1)
-    most = min(rows, flat.size)
+    most = min(rows, mean.size)
     wanted = min(_FIRST_MODES if count is None else count, most)
+    if count is not None:
+        basis = _basis(blocks, mean, wanted, most, seed)
+        return with_step(_measured(blocks, basis), partial(_measured, blocks))
+    some = _spread_rows(blocks, rows)
+
+    def loss_on_some(modes: int) -> float:
+        own = _basis(lambda: [some], mean, modes, most, seed)
+        return _measured(lambda: [some], own).loss_mean
+
+    # Where the modes of some rows alone do not do for these rows, those of all rows do not either.
+    while wanted < most and not loss_on_some(wanted) < loss_mean:
+        wanted = min(2 * wanted, most)
     while True:
-        modes = _modes(blocks, flat, min(wanted + _OVERSAMPLING, most), seed)[:wanted]
-        shaped = modes.reshape(len(modes), *mean.shape).astype(np.float32)
-        basis = _measured(blocks, FieldBasis(mean.astype(np.float32), shaped, 0.0, 0.0))
-        if count is not None:
-            return with_step(basis, partial(_measured, blocks))
-        if basis.loss_mean < loss_mean:
-            fewest = _fewest(blocks, basis, loss_mean)
+        basis = _basis(blocks, mean, wanted, most, seed)
+        fewest = _fewest(blocks, some, basis, loss_mean)
+        if fewest.loss_mean < loss_mean:
             return with_step(fewest, partial(_measured, blocks), below=loss_mean)
         if wanted == most:
             raise DatasetError(
-                f"{wanted} modes lose {basis.loss_mean:.3g} on average, allowed are"
+                f"{wanted} modes lose {fewest.loss_mean:.3g} on average, allowed are"
                 f" {loss_mean:.3g}",
                 remedy="allow more; float32 holds a field of 1 mm to about 1e-10 m",
             )
         wanted = min(2 * wanted, most)
+
+
+def _basis(blocks: Blocks, mean: Floats, wanted: int, most: int, seed: int) -> FieldBasis:
+    """The first modes of fields with a mean, shape (V, 3); their loss is not known yet."""
+    modes = _modes(blocks, mean.reshape(-1), min(wanted + _OVERSAMPLING, most), seed)[:wanted]
+    shaped = modes.reshape(len(modes), *mean.shape).astype(np.float32)
+    return FieldBasis(mean.astype(np.float32), shaped, 0.0, 0.0)
 
 
 def with_step(
@@ -252,17 +269,45 @@ def _measured(blocks: Blocks, basis: FieldBasis) -> FieldBasis:
     return replace(basis, loss_mean=mean, loss_max=largest)
 
 
-def _fewest(blocks: Blocks, enough: FieldBasis, loss_mean: float) -> FieldBasis:
-    """The shortest beginning of the modes that is still good enough, by bisection."""
-    too_few, best = 0, enough
-    while len(best.modes) - too_few > 1:
-        middle = (too_few + len(best.modes)) // 2
-        tried = _measured(blocks, replace(enough, modes=enough.modes[:middle]))
-        if tried.loss_mean < loss_mean:
-            best = tried
+def _fewest(blocks: Blocks, some: FloatArray, basis: FieldBasis, loss_mean: float) -> FieldBasis:
+    """The shortest beginning of the modes that is good enough, or nearly; all if none is.
+
+    A pass over all rows takes long, so how many are enough is asked of some, by bisection, and of
+    all of them only in the end; where those want more, a thirtieth is added at a time.
+
+    Returns:
+        Its loss is that of all rows, or too large, of some of them.
+    """
+
+    def first(modes: int, rows: Blocks) -> FieldBasis:
+        return _measured(rows, replace(basis, modes=basis.modes[:modes]))
+
+    too_few, enough = 0, len(basis.modes)
+    whole = first(enough, lambda: [some])
+    if not whole.loss_mean < loss_mean:
+        return whole
+    while enough - too_few > 1:
+        middle = (too_few + enough) // 2
+        if first(middle, lambda: [some]).loss_mean < loss_mean:
+            enough = middle
         else:
             too_few = middle
-    return best
+    while True:
+        found = first(enough, blocks)
+        if found.loss_mean < loss_mean or enough == len(basis.modes):
+            return found
+        enough = min(len(basis.modes), enough + max(1, enough // 30))
+
+
+def _spread_rows(blocks: Blocks, rows: int) -> FloatArray:
+    """Some of the rows, evenly spaced: `_SOME_ROWS`, or all where they are not more."""
+    wanted = np.unique(np.linspace(0, rows - 1, min(rows, _SOME_ROWS)).round().astype(int))
+    found, first = [], 0
+    for block in blocks():
+        here = wanted[(wanted >= first) & (wanted < first + len(block))] - first
+        found.append(block[here])
+        first += len(block)
+    return np.concatenate(found)
 
 
 def _mean(blocks: Blocks) -> tuple[Floats, int]:
