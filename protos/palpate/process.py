@@ -7,11 +7,13 @@ import gc
 import importlib
 import importlib.util
 import os
+import queue
 import shlex
 import sys
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Self
@@ -108,6 +110,24 @@ class Closing(ABC):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def setter_for_signals(event: threading.Event) -> Callable[[], None]:
+    """A function that sets an event and that a signal handler may call.
+
+    ``Event.set`` takes a lock that is no use to its own thread twice. A handler runs in the main
+    thread between any two of its steps, also while that thread waits for the event or sets it, and
+    would wait for itself for ever. So a thread sets it; ``SimpleQueue.put`` may be interrupted.
+    """
+    told: queue.SimpleQueue[None] = queue.SimpleQueue()
+
+    def pass_on() -> None:
+        while True:
+            told.get()
+            event.set()
+
+    threading.Thread(target=pass_on, name="signals", daemon=True).start()
+    return lambda: told.put(None)
 
 
 def require(module: str, *, extra: str) -> ModuleType:

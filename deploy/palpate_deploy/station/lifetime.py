@@ -18,6 +18,7 @@ from pathlib import Path
 from types import FrameType
 
 from palpate.heartbeat import without_watch
+from palpate.process import setter_for_signals
 
 PARENT_PID = "_PALPATE_PARENT_PID"
 """Environment variable with the process id of the parent; a process without it ends alone."""
@@ -29,9 +30,10 @@ _POLL_S = 0.5
 def stop_on_signals(*signals: signal.Signals) -> threading.Event:
     """An event that each of these signals sets; none given = ``SIGINT`` and ``SIGTERM``."""
     stop = threading.Event()
+    tell = setter_for_signals(stop)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
+        tell()
 
     for number in signals or (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)

@@ -21,7 +21,7 @@ import typer
 from palpate.config import joining_link, parse_config
 from palpate.errors import ConfigError
 from palpate.files.simulation_store import SUFFIX
-from palpate.process import typed_command
+from palpate.process import setter_for_signals, typed_command
 from palpate.rigid import path_lengths
 from palpate_fem.arrays import Floats
 from palpate_fem.calibration.result import without_nan
@@ -326,9 +326,10 @@ def serve_command(
     )
     link = joining_link(connect, wait_s=_ROUTER_WAIT_S, tls=tls)
     stop = threading.Event()
+    tell = setter_for_signals(stop)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
+        tell()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)

@@ -24,6 +24,8 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from palpate.process import setter_for_signals
+
 console = Console(stderr=True)
 """For progress and remarks."""
 
@@ -84,11 +86,12 @@ def print_table(
 def stop_on_signal() -> Iterator[threading.Event]:
     """An event that is set by the first Ctrl-C or ``SIGTERM``; a second Ctrl-C ends at once."""
     stop = threading.Event()
+    tell = setter_for_signals(stop)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         console.print("stopping; what has ended is kept")
-        stop.set()
+        tell()
 
     before = {
         number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
