@@ -9,13 +9,14 @@ import importlib.util
 import os
 import queue
 import shlex
+import signal
 import sys
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, TracebackType
+from types import FrameType, ModuleType, TracebackType
 from typing import Self
 
 from palpate.errors import MissingExtraError
@@ -128,6 +129,19 @@ def setter_for_signals(event: threading.Event) -> Callable[[], None]:
 
     threading.Thread(target=pass_on, name="signals", daemon=True).start()
     return lambda: told.put(None)
+
+
+def stop_on_signals(*signals: signal.Signals) -> threading.Event:
+    """An event that each of these signals sets; none given = ``SIGINT`` and ``SIGTERM``."""
+    stop = threading.Event()
+    tell = setter_for_signals(stop)
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        tell()
+
+    for number in signals or (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    return stop
 
 
 def require(module: str, *, extra: str) -> ModuleType:

@@ -31,7 +31,7 @@ from palpate.client.simulations import GRACE_S, straight_path
 from palpate.config import joining_link
 from palpate.errors import PalpateError, RemoteError, StaleError, StreamTimeout
 from palpate.messages import SimulationOutcome, SimulationRequest, Status
-from palpate_deploy.station.lifetime import stop_on_signals
+from palpate.process import stop_on_signals
 
 SENSOR = "finger"
 FRESH_S = 0.03

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import StreamTimeout
-from palpate.process import avoid_pauses
-from palpate_deploy.station.lifetime import end_with_parent, stop_on_signals
+from palpate.process import avoid_pauses, stop_on_signals
+from palpate_deploy.station.lifetime import end_with_parent
 from palpate_gateway.one_core import stay_on_one_core
 
 if TYPE_CHECKING:  # the floor, which uses this module too, does without palpate's bus

@@ -24,7 +24,7 @@ from rich.table import Table
 from palpate.bus import Delivery, Session, Subscriber
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS
 from palpate.errors import ConfigError, ErrorCode, RemoteError, StreamTimeout
-from palpate.process import require
+from palpate.process import require, stop_on_signals
 from palpate_deploy.bench.growth import (
     BINS,
     MEGABYTE,
@@ -37,7 +37,6 @@ from palpate_deploy.bench.growth import (
 )
 from palpate_deploy.bench.results import finish, progress_bar
 from palpate_deploy.station.host import join, private_profile
-from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import Profile, plain_values

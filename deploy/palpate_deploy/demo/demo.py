@@ -16,6 +16,7 @@ from rich.table import Table
 from palpate import Client
 from palpate.errors import LinkError, PalpateError, StreamTimeout
 from palpate.files.atomic import written_whole
+from palpate.process import stop_on_signals
 from palpate_deploy.demo.comparison import (
     FieldComparison,
     FieldMedians,
@@ -24,7 +25,6 @@ from palpate_deploy.demo.comparison import (
 )
 from palpate_deploy.diagnose.records import error_lines, viewer_command
 from palpate_deploy.station.host import private_profile
-from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.supervision import Supervisor

@@ -19,7 +19,7 @@ from palpate.bus import Session
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError, printable
 from palpate.files.record import RecordSummary, check_readable, recover, summarise
-from palpate_deploy.station.lifetime import stop_on_signals
+from palpate.process import stop_on_signals
 from palpate_deploy.station.logs import cell
 from palpate_deploy.station.status import duration_text
 

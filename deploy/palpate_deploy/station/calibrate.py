@@ -31,8 +31,7 @@ from palpate.client.estimates import ask_tare
 from palpate.client.models import ModelAdmin
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError, LinkError, RecordingError, RemoteError, StreamTimeout
-from palpate.process import check_installed
-from palpate_deploy.station.lifetime import stop_on_signals
+from palpate.process import check_installed, stop_on_signals
 from palpate_deploy.station.profile import Profile
 from palpate_services.config import EVERYTHING, ModelsConfig, RecorderConfig
 from palpate_services.inference.repository import Repository

@@ -34,9 +34,9 @@ from palpate.messages import (
     Tare,
     WrenchFrame,
 )
+from palpate.process import stop_on_signals
 from palpate_deploy.station.calibrate import CalibrationOrder, calibrate_finger
 from palpate_deploy.station.host import join, write_profile
-from palpate_deploy.station.lifetime import stop_on_signals
 from palpate_deploy.station.logs import cell
 from palpate_deploy.station.new_station import FINGER, WRENCH_SENSOR
 from palpate_deploy.station.processes import FiniteRun

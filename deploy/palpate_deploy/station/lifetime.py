@@ -1,4 +1,4 @@
-"""How a process ends: by a signal, and together with the process that started it.
+"""How a process ends together with the process that started it.
 
 A parent that is killed with ``kill -9`` cannot stop its children, so they watch it: the environment
 names the parent's process id, and each child gets ``SIGTERM`` when that process is gone.
@@ -15,29 +15,14 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 
 from palpate.heartbeat import without_watch
-from palpate.process import setter_for_signals
 
 PARENT_PID = "_PALPATE_PARENT_PID"
 """Environment variable with the process id of the parent; a process without it ends alone."""
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _POLL_S = 0.5
-
-
-def stop_on_signals(*signals: signal.Signals) -> threading.Event:
-    """An event that each of these signals sets; none given = ``SIGINT`` and ``SIGTERM``."""
-    stop = threading.Event()
-    tell = setter_for_signals(stop)
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        tell()
-
-    for number in signals or (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
-    return stop
 
 
 def environment_for_children() -> dict[str, str]:

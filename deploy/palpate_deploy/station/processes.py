@@ -17,15 +17,10 @@ from typing import Self
 
 from palpate.config import LinkConfig, Role
 from palpate.errors import ConfigError, PalpateError
-from palpate.process import check_installed
+from palpate.process import check_installed, stop_on_signals
 from palpate_deploy.station import logs
 from palpate_deploy.station.host import new_run_folder, write_profile
-from palpate_deploy.station.lifetime import (
-    end_with_parent,
-    start_child,
-    stop_child,
-    stop_on_signals,
-)
+from palpate_deploy.station.lifetime import end_with_parent, start_child, stop_child
 from palpate_deploy.station.profile import Profile, Service
 
 _log = logging.getLogger(__name__)

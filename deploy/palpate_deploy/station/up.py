@@ -22,9 +22,9 @@ from palpate.errors import ConfigError, PalpateError, StreamTimeout
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import ServiceManager
 from palpate.messages import ServiceState, Status, SupervisedProcess
-from palpate.process import Closing, ProcessUsage
+from palpate.process import Closing, ProcessUsage, stop_on_signals
 from palpate_deploy.station.host import join
-from palpate_deploy.station.lifetime import end_with_parent, stop_on_signals
+from palpate_deploy.station.lifetime import end_with_parent
 from palpate_deploy.station.logs import cell, print_error
 from palpate_deploy.station.processes import check_packages, ended_error
 from palpate_deploy.station.profile import Profile

@@ -5,14 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import signal
 import statistics
-import threading
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -21,7 +18,7 @@ import typer
 from palpate.config import joining_link, parse_config
 from palpate.errors import ConfigError
 from palpate.files.simulation_store import SUFFIX
-from palpate.process import setter_for_signals, typed_command
+from palpate.process import stop_on_signals, typed_command
 from palpate.rigid import path_lengths
 from palpate_fem.arrays import Floats
 from palpate_fem.calibration.result import without_nan
@@ -325,14 +322,7 @@ def serve_command(
         where="command line",
     )
     link = joining_link(connect, wait_s=_ROUTER_WAIT_S, tls=tls)
-    stop = threading.Event()
-    tell = setter_for_signals(stop)
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        tell()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
+    stop = stop_on_signals()
     print_lines(
         f"fem serves {sensor!r} at station {station!r} through {connect}: {count} workers, "
         + (f"{config.slots} slots on {device}, " if device else "")

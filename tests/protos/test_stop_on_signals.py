@@ -7,7 +7,7 @@ import sys
 
 WAITS = """
 import signal, sys, threading
-from palpate_deploy.station.lifetime import stop_on_signals
+from palpate.process import stop_on_signals
 
 stop = stop_on_signals(signal.SIGTERM)
 
