@@ -52,7 +52,6 @@ Floats = NDArray[np.float64]
 
 OUT = Path(__file__).parent / "results" / "calibrate"
 SETS = {"calibrate": "the three that ship", "drawn": "drawn ones"}
-LIKE_PAPER = "like the paper's, at other points"  # as docs/make_shipped.py calls them
 SHOTS = (6, 10, 20)
 SPECIMENS_MOST = 8
 DRAWS = 3
@@ -213,7 +212,7 @@ def page(facts: dict[str, Any]) -> str:
     others = [one["unlike"] for one in facts["real"]]
     shipped = json.loads((OUT.parent / "shipped.json").read_text(encoding="utf-8"))
     own_n, own_m = (
-        next(one["value"] for one in shipped[LIKE_PAPER][0]["figures"] if one["name"] == name)
+        next(one["value"] for one in shipped["points"][0]["figures"] if one["name"] == name)
         for name in ("force_magnitude", "contact_location")
     )
     least, most, real_least, real_most = min(twin), max(twin), min(others), max(others)

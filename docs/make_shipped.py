@@ -15,15 +15,13 @@ from typing import Any
 
 from palpate_services.inference.repository import resolve
 from palpate_training.figures.style import markdown_table
-from palpate_training.tasks.evaluate import evaluate
+from palpate_training.tasks.evaluate import SHOWN, evaluate
 
 PAGE = Path(__file__).parent / "results" / "shipped.md"
 RESULTS = PAGE.with_suffix(".json")
 
-RUNS = {
-    "like the paper's, at other points": ("calibrate", "check", "test"),
-    "at random": ("random",),
-}
+RUNS = {"points": ("calibrate", "check", "test"), "random": ("random",)}
+TITLES = {"points": "like the paper's, at other points", "random": "at random"}
 BUNDLES = {"features-twin": None, "field-twin": None, "synthesis-twin": "biotac-2"}
 """By the specimen whose rows are taken; None = all three."""
 
@@ -34,7 +32,6 @@ HEADS = {
     "above_8n": "above 8 N",
     "from_2n": "from 2 N",
 }
-SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0)}
 WORDS = {
     "force_magnitude": "force",
     "force_magnitude_over_norm": "force, over the true one",
@@ -101,7 +98,7 @@ def table_of(found: list[dict[str, Any]]) -> str:
 def page(found: dict[str, list[dict[str, Any]]]) -> str:
     """The page."""
     tables = "\n".join(
-        f"## Presses {presses}\n\n"
+        f"## Presses {TITLES[presses]}\n\n"
         f"{errors[0]['presses']} presses, {errors[0]['rows']} rows from 0.5 N.\n\n"
         f"{table_of(errors)}"
         for presses, errors in found.items()

@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 
 console = Console()
 
-SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0)}
-"""What people read instead of an SI unit, and the factor to it."""
-
 
 def _words(text: str) -> tuple[str, ...]:
     return tuple(word.strip() for word in text.split(",") if word.strip())
@@ -157,7 +154,7 @@ def train_evaluate(
 
 def _table(found: BundleErrors) -> Table:
     """Errors by force, one quantity after the other."""
-    from palpate_training.tasks.evaluate import KINDS
+    from palpate_training.tasks.evaluate import KINDS, SHOWN
 
     table = Table(
         title=f"{found.bundle}: {found.rows} rows of {found.presses} presses",

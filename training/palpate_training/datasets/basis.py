@@ -275,17 +275,12 @@ def _fewest(blocks: Blocks, some: FloatArray, basis: FieldBasis, loss_mean: floa
     A pass over all rows takes long, so how many are enough is asked of some, by bisection, and of
     all of them only in the end; where those want more, a thirtieth is added at a time.
 
-    Returns:
-        Its loss is that of all rows, or too large, of some of them.
     """
 
     def first(modes: int, rows: Blocks) -> FieldBasis:
         return _measured(rows, replace(basis, modes=basis.modes[:modes]))
 
     too_few, enough = 0, len(basis.modes)
-    whole = first(enough, lambda: [some])
-    if not whole.loss_mean < loss_mean:
-        return whole
     while enough - too_few > 1:
         middle = (too_few + enough) // 2
         if first(middle, lambda: [some]).loss_mean < loss_mean:

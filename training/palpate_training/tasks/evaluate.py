@@ -17,6 +17,7 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate.files.bundle import Bundle, read_bundle
 from palpate.files.hdf5 import schema_of
+from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     MixedDataset,
@@ -90,6 +91,9 @@ KINDS = {
 }
 """By the name of the error; ``learning.metrics`` defines them. ``displacement`` is the mean over
 all nodes, ``contact_force_misplaced`` the share of the force that is on other nodes or turned."""
+
+SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0)}
+"""What people read instead of an SI unit, and the factor to it."""
 
 
 class Figure(NamedTuple):
@@ -206,17 +210,17 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
     parts: list[_Errors] = []
     for path in paths:
         if manifest.task == "features":
-            data, source, digest = _features(path)
+            data, provenance, digest = read_features(path)
             parts.append(_of_features(bundle, data, _rows_of_sensor(data, unit, path)))
         else:
             mixed = read_mixed(path)
             _check_mesh(bundle, mixed, path)
             experiment = mixed.experiment
-            source, digest = experiment.provenance.source, content_sha256(mixed)
+            provenance, digest = experiment.provenance, content_sha256(mixed)
             rows = _rows_of_unit(experiment, unit, path)
             of = _of_field if manifest.task == "field" else _of_synthesis
             parts.append(of(bundle, mixed, rows))
-        about.append((source, digest))
+        about.append((provenance.source, digest))
     errors = _joined(parts)
     return BundleErrors(
         bundle=f"{manifest.name} {manifest.version}",
@@ -239,13 +243,22 @@ def _check_mesh(bundle: Bundle, data: MixedDataset, path: Path) -> None:
         )
 
 
-def _features(path: Path) -> tuple[FeatureDataset, str, str]:
-    """Rows of features of a file, its source and its digest."""
+def read_features(path: Path) -> tuple[FeatureDataset, Provenance, str]:
+    """Rows of features of a file of features or of a mixed one; the file's origin and digest (hex).
+
+    Raises:
+        DatasetError: It breaks its schema.
+    """
     if schema_of(path, extra="training") == FEATURES_SCHEMA.name:
         data = open_dataset(path)
-        return data, data.provenance.source, data.content_sha256()
+        return data, data.provenance, data.content_sha256()
     mixed = read_mixed(path)
-    return features(mixed), mixed.experiment.provenance.source, content_sha256(mixed)
+    return features(mixed), mixed.experiment.provenance, content_sha256(mixed)
+
+
+def press_of(data: FeatureDataset) -> Labels:
+    """Press of each row; a recording that is a single group is told apart by its blocks."""
+    return data.group if len(np.unique(data.group)) > 1 else data.block
 
 
 def _rows_of_sensor(data: FeatureDataset, unit: str | None, path: Path) -> Rows:
@@ -278,7 +291,7 @@ def _some(rows: Rows, path: Path) -> Rows:
 
 def _of_features(bundle: Bundle, data: FeatureDataset, rows: Rows) -> _Errors:
     tared, truth = data.tared_counts[rows], data.force[rows]
-    answers = join(_answers(bundle, lambda part: tared[part], np.arange(len(rows))))
+    answers = join(answers_of(bundle, lambda part: tared[part], np.arange(len(rows))))
 
     def errors(given: Callable[[str, FloatArray], FloatArray]) -> dict[str, Floats]:
         force = force_errors(given("force", truth), truth)
@@ -299,12 +312,11 @@ def _of_features(bundle: Bundle, data: FeatureDataset, rows: Rows) -> _Errors:
                 )
         return found
 
-    press = data.group if len(np.unique(data.group)) > 1 else data.block
     return _Errors(
         errors(lambda name, _: answers[name]),
         errors(_mean_of_rows),
         np.linalg.norm(truth.astype(np.float64), axis=1),
-        press[rows],
+        press_of(data)[rows],
     )
 
 
@@ -321,7 +333,7 @@ def _of_field(bundle: Bundle, data: MixedDataset, rows: Rows) -> _Errors:
     known = "contact_force" in outputs and data.contact is not None
     forces = spread_forces_in_parts(data, rows) if known else None
     for part, answers in zip(
-        in_parts(rows), _answers(bundle, lambda part: tared[part], rows), strict=True
+        in_parts(rows), answers_of(bundle, lambda part: tared[part], rows), strict=True
     ):
         truth = data.displacement(part)
         each = {
@@ -344,7 +356,7 @@ def _of_field(bundle: Bundle, data: MixedDataset, rows: Rows) -> _Errors:
 def _of_synthesis(bundle: Bundle, data: MixedDataset, rows: Rows) -> _Errors:
     truth = tared_counts(data)[rows]
     answers = join(
-        _answers(bundle, lambda part: data.displacement(part).reshape(len(part), -1), rows)
+        answers_of(bundle, lambda part: data.displacement(part).reshape(len(part), -1), rows)
     )
     found, constant = (
         {"electrodes": electrode_errors(estimate, truth)["mean_square"]}
@@ -357,7 +369,7 @@ def _force_and_press(data: ExperimentDataset, rows: Rows) -> tuple[Floats, Label
     return np.linalg.norm(data.force[rows].astype(np.float64), axis=1), data.row_trajectory[rows]
 
 
-def _answers(
+def answers_of(
     bundle: Bundle, inputs: Callable[[Rows], FloatArray], rows: Rows
 ) -> Iterator[dict[str, FloatArray]]:
     """Outputs of a bundle's model by name, for each part of the rows."""

@@ -17,16 +17,16 @@ import numpy.typing as npt
 
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import Bundle, read_bundle, write_bundle
-from palpate.files.hdf5 import schema_of
 from palpate.files.intervals import BoundFormula, Intervals
 from palpate.files.training_range import KnownInputs
 from palpate_training.datasets.experiment import MixedDataset, content_sha256, read_mixed
-from palpate_training.datasets.export import features
 from palpate_training.datasets.features import FeatureDataset, FloatArray, open_dataset
-from palpate_training.learning.export import refuse_existing, session_of
+from palpate_training.learning.export import refuse_existing
+from palpate_training.learning.field_code import in_parts
 from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
-from palpate_training.learning.metrics import field_errors, force_errors, location_errors
+from palpate_training.learning.metrics import field_errors, force_errors, join, location_errors
 from palpate_training.learning.ranges import UNLIKE, places_of, with_pattern
+from palpate_training.tasks.evaluate import answers_of, press_of, read_features
 from palpate_training.tasks.fields import tared_counts
 
 Floats = npt.NDArray[np.float64]
@@ -35,12 +35,8 @@ Labels = npt.NDArray[np.integer]
 PRESSES_LEAST = 20
 """Of fewer presses nine tenths are not known well enough to be shipped with a bundle."""
 
-_FEATURES = "palpate.features"
-
 OF_OTHERS = (True, True, False, False, False)
 """Terms of bounds for sensors that a bundle was not made for: two fingers cannot teach more."""
-
-_ROWS = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +64,10 @@ class HeldOut:
 
 
 def held_out_features(bundle: Bundle, data: FeatureDataset) -> HeldOut:
-    """Errors of the rows in contact; where contact is not known, of all rows.
-
-    A recording that is a single group is told apart by its blocks.
-    """
+    """Errors of the rows in contact; where contact is not known, of all rows."""
     rows = np.arange(len(data)) if data.in_contact is None else np.flatnonzero(data.in_contact)
     tared, truth = data.tared_counts[rows], data.force[rows]
-    answers = _answers(bundle, tared)
+    answers = join(answers_of(bundle, lambda part: tared[part], np.arange(len(tared))))
     force = answers["force"]
     found = force_errors(force, truth)
     size = np.linalg.norm(force.astype(np.float64), axis=1)
@@ -85,9 +78,8 @@ def held_out_features(bundle: Bundle, data: FeatureDataset) -> HeldOut:
         # Below its threshold a bundle gives no location.
         given = size >= bundle.manifest.contact_threshold_n
         errors["contact_location"] = np.where(given, distance, np.nan)
-    press = data.group if len(np.unique(data.group)) > 1 else data.block
     return HeldOut(
-        errors, size, tared, np.linalg.norm(truth.astype(np.float64), axis=1), press[rows]
+        errors, size, tared, np.linalg.norm(truth.astype(np.float64), axis=1), press_of(data)[rows]
     )
 
 
@@ -95,9 +87,9 @@ def held_out_fields(bundle: Bundle, data: MixedDataset) -> HeldOut:
     """Errors of the fields of all rows."""
     tared = tared_counts(data)
     parts, sizes = [], []
-    for start in range(0, len(tared), _ROWS):
-        rows = slice(start, start + _ROWS)
-        answers = _answers(bundle, tared[rows])
+    whole = np.arange(len(tared))
+    found = answers_of(bundle, lambda part: tared[part], whole)
+    for rows, answers in zip(in_parts(whole), found, strict=True):
         field = answers["displacement"].reshape(-1, *data.mesh.nodes.shape)
         parts.append(field_errors(field, data.displacement(rows), data.mesh.subset)["all_m"])
         coefficients = answers.get("coefficients", np.zeros((len(field), 1)))
@@ -190,19 +182,14 @@ class ReadRows(NamedTuple):
 
 def read_held_out(bundle: Bundle, path: Path) -> ReadRows:
     """What a bundle makes of a data set of features, or of a mixed one."""
-    if bundle.manifest.task == "features" and schema_of(path, extra="training") == _FEATURES:
-        data = open_dataset(path)
-        about = data.provenance
-        rows, digest = held_out_features(bundle, data), data.content_sha256()
-        return ReadRows(rows, digest, f"{about.source} ({about.command})")
-    mixed = read_mixed(path)
-    about = mixed.experiment.provenance
-    rows = (
-        held_out_fields(bundle, mixed)
-        if bundle.manifest.task == "field"
-        else held_out_features(bundle, features(mixed))
-    )
-    return ReadRows(rows, content_sha256(mixed), f"{about.source} ({about.command})")
+    if bundle.manifest.task == "features":
+        data, about, digest = read_features(path)
+        rows = held_out_features(bundle, data)
+    else:
+        mixed = read_mixed(path)
+        about, digest = mixed.experiment.provenance, content_sha256(mixed)
+        rows = held_out_fields(bundle, mixed)
+    return ReadRows(rows, digest, f"{about.source} ({about.command})")
 
 
 def joined(parts: Sequence[HeldOut]) -> HeldOut:
@@ -241,10 +228,3 @@ def _of_others(
         fit_formulas(errors, rows.terms(known), rows.press, use=OF_OTHERS),
         f"{len(rows.press)} rows of {names}, for which it was not made; another may need more",
     )
-
-
-def _answers(bundle: Bundle, tared: FloatArray) -> dict[str, FloatArray]:
-    """Outputs of a bundle's model by name."""
-    names = [tensor.name for tensor in bundle.manifest.outputs]
-    feeds = {bundle.manifest.inputs[0].name: np.asarray(tared, np.float32)}
-    return dict(zip(names, session_of(bundle.model).run(names, feeds), strict=True))
