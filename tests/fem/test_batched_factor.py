@@ -67,7 +67,9 @@ def forest(seed: int) -> Floats:
 class Bench:
     """A factor, and its slots' matrices."""
 
-    def __init__(self, matrices: list[Floats], groups: Ints | None = None) -> None:
+    def __init__(
+        self, matrices: list[Floats], groups: Ints | None = None, few: int | None = None
+    ) -> None:
         upper = sp.triu(sp.csr_matrix(sum(abs(matrix) for matrix in matrices)), format="csr")
         upper.sort_indices()
         self.size, self.slots = len(matrices[0]), len(matrices)
@@ -75,7 +77,7 @@ class Bench:
         self.rows = np.repeat(np.arange(self.size), np.diff(self.indptr))
         groups = np.arange(self.size, dtype=np.int32) if groups is None else groups
         self.factor = BatchedFactor(
-            self.indptr, self.indices, groups, slots=self.slots, device=DEVICE
+            self.indptr, self.indices, groups, slots=self.slots, device=DEVICE, few=few, columns=1
         )
         for slot, matrix in enumerate(matrices):
             self.put(slot, matrix)
@@ -110,10 +112,10 @@ def assert_solves(matrix: Floats, answers: Floats, rights: Floats) -> None:
     assert np.abs(answers - wanted).max() < SAME * np.abs(wanted).max()
 
 
-@pytest.fixture(scope="module")
-def grids() -> Bench:
-    """Three slots and several levels."""
-    return Bench([grid(20, 30, seed) for seed in range(3)])
+@pytest.fixture(scope="module", params=[0, 1000], ids=["panels", "columns"])
+def grids(request: pytest.FixtureRequest) -> Bench:
+    """Three slots and several levels, by one block of threads a front or by many."""
+    return Bench([grid(20, 30, seed) for seed in range(3)], few=request.param)
 
 
 def restored(bench: Bench) -> Bench:
@@ -188,6 +190,24 @@ def test_a_factor_made_twice_has_the_same_bits() -> None:
         bench.factorise()
         answers.append(bench.solve(bench.right(2)))
     np.testing.assert_array_equal(answers[0], answers[1])
+
+
+@pytest.mark.parametrize("body", range(len(BODIES) + 1))
+def test_columns_by_many_blocks_have_the_bits_of_panels_by_one(body: int) -> None:
+    """All levels, or the last ones only; also where a slot's matrix is not definite."""
+    if body < len(BODIES):
+        matrices = [two_bodies(*BODIES[body], seed) for seed in (8, 4, 2)]
+    else:
+        matrices = [grid(20, 30, seed) for seed in range(3)]
+    matrices[1][-1, -1] = -1.0
+    found = []
+    for few in (0, 3, 1000):
+        bench = Bench(matrices, few=few)
+        bad = bench.factorise()
+        assert bad == [0, 1, 0]
+        found.append(bench.solve(bench.right(2))[[0, 2]])
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])
 
 
 def test_only_what_has_changed_is_factorised_again(grids: Bench) -> None:

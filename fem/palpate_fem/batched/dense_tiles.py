@@ -53,27 +53,10 @@ TENSOR_CORES = """
 #endif
 """
 
-_CHILDREN = """
-    // Where a front's rows are in the border of its child k; the first tile of that one's share.
-    auto rows_in = [=](int k) { return rows_in_child.data + children.data[3 * k]; };
-    auto share_of = [=](int k) {
-        return shares.data + (size_t(first_share) + children.data[3 * k + 1]) * 1024;
-    };
-    // An entry of a share, a lower triangle. Where there is none, the first one is read in vain:
-    // with a branch a thread would wait for each entry before it asks for the next.
-    auto entry_of = [](const double* share, int a, int b) {
-        const bool inside = a >= (b & 0x7fffffff);  // -1 becomes the largest number
-        const int row = (((a >> 5) * ((a >> 5) + 1)) >> 1) * 1024 + (a & 31) * 32;
-        const int column = (b >> 5) * 1024 + (b & 31);
-        const double value = share[inside ? row + column : 0];
-        return inside ? value : 0.0;
-    };
-"""
-
 _PRODUCTS = (
     TENSOR_CORES
-    + _CHILDREN
     + """
+    const int lane = thread % 32;
 #ifdef PALPATE_TENSOR_CORES
     const int row = lane / 4, column = 2 * (lane % 4);
     // A warp works on half a tile, 16 rows of it: the sums of a whole one take too many registers.
@@ -89,6 +72,52 @@ _PRODUCTS = (
         }
     };
     auto int_pair_at = [](const int* p) { return *reinterpret_cast<const int2*>(p); };
+    // Half of: target = - sum - sum over i of a_i times transposed b_i
+    auto subtract = [=](double (&sum)[2][4][2], double* target, const double* a, const double* b,
+                        int count, int half) {
+        __syncwarp();  // threads that gathered meet again
+        for (int i = 0; i < count; ++i)
+            add_tiles(sum, a + 1024 * i + 512 * half, b + 1024 * i);
+        #pragma unroll
+        for (int m = 0; m < 2; ++m)
+            #pragma unroll
+            for (int n = 0; n < 4; ++n)
+                *reinterpret_cast<double2*>(
+                    target + 512 * half + (8 * m + row) * 32 + 8 * n + column)
+                    = make_double2(-sum[m][n][0], -sum[m][n][1]);
+    };
+#else
+    // Target = begin - sum over n of a_n times transposed b_n
+    auto subtract = [](double* target, const double* a, const double* b, int count, auto begin) {
+        for (int i = 0; i < 32; ++i)
+            for (int j = 0; j < 32; ++j) {
+                double sum = begin(i, j);
+                for (int n = 0; n < count; ++n)
+                    for (int k = 0; k < 32; ++k)
+                        sum -= a[1024 * n + 32 * i + k] * b[1024 * n + 32 * j + k];
+                target[32 * i + j] = sum;
+            }
+    };
+#endif
+"""
+)
+
+_CHILDREN = """
+    // Where a front's rows are in the border of its child k; the first tile of that one's share.
+    auto rows_in = [=](int k) { return rows_in_child.data + children.data[3 * k]; };
+    auto share_of = [=](int k) {
+        return shares.data + (size_t(first_share) + children.data[3 * k + 1]) * 1024;
+    };
+    // An entry of a share, a lower triangle. Where there is none, the first one is read in vain:
+    // with a branch a thread would wait for each entry before it asks for the next.
+    auto entry_of = [](const double* share, int a, int b) {
+        const bool inside = a >= (b & 0x7fffffff);  // -1 becomes the largest number
+        const int row = (((a >> 5) * ((a >> 5) + 1)) >> 1) * 1024 + (a & 31) * 32;
+        const int column = (b >> 5) * 1024 + (b & 31);
+        const double value = share[inside ? row + column : 0];
+        return inside ? value : 0.0;
+    };
+#ifdef PALPATE_TENSOR_CORES
     // Half of what the children's shares add up to in tile (r, c), negative.
     auto gather = [=](double (&sum)[2][4][2], int r, int c, int half) {
         for (int k = child; k < last_child; ++k) {
@@ -107,20 +136,6 @@ _PRODUCTS = (
             }
         }
     };
-    // Half of: target = - sum - sum over i of a_i times transposed b_i
-    auto subtract = [=](double (&sum)[2][4][2], double* target, const double* a, const double* b,
-                        int count, int half) {
-        __syncwarp();  // threads that gathered meet again
-        for (int i = 0; i < count; ++i)
-            add_tiles(sum, a + 1024 * i + 512 * half, b + 1024 * i);
-        #pragma unroll
-        for (int m = 0; m < 2; ++m)
-            #pragma unroll
-            for (int n = 0; n < 4; ++n)
-                *reinterpret_cast<double2*>(
-                    target + 512 * half + (8 * m + row) * 32 + 8 * n + column)
-                    = make_double2(-sum[m][n][0], -sum[m][n][1]);
-    };
 #else
     // What the children's shares add up to at row i and column j of tile (r, c).
     auto gathered = [=](int r, int c, int i, int j) {
@@ -129,26 +144,12 @@ _PRODUCTS = (
             sum += entry_of(share_of(k), rows_in(k)[32 * r + i], rows_in(k)[32 * c + j]);
         return sum;
     };
-    // Target = begin - sum over n of a_n times transposed b_n
-    auto subtract = [](double* target, const double* a, const double* b, int count, auto begin) {
-        for (int i = 0; i < 32; ++i)
-            for (int j = 0; j < 32; ++j) {
-                double sum = begin(i, j);
-                for (int n = 0; n < count; ++n)
-                    for (int k = 0; k < 32; ++k)
-                        sum -= a[1024 * n + 32 * i + k] * b[1024 * n + 32 * j + k];
-                target[32 * i + j] = sum;
-            }
-    };
 #endif
 """
-)
 
 _SUBTRACT_PRODUCT = (
-    """
-    const int lane = thread % 32;
-"""
-    + _PRODUCTS
+    _PRODUCTS
+    + _CHILDREN
     + """
     double* target = shares.data + size_t(tile) * 1024;
     const double* a = panels.data + size_t(left) * 1024;
@@ -173,11 +174,9 @@ FRONT = """
     auto tiles_of = [=](int r) { return tiles + size_t(above(r)) * 1024; };
 """
 
-_FACTORISE = (
-    """
-    const int lane = thread % 32;
-"""
-    + _PRODUCTS
+_PANEL = (
+    _PRODUCTS
+    + _CHILDREN
     + FRONT
     + """
     // Which of the matrix's entries stand in a tile, if any do: -1 = none, -2 = a one.
@@ -191,19 +190,6 @@ _FACTORISE = (
         return source >= 0 ? value : source == -2 ? 1.0 : 0.0;
     };
 #ifdef PALPATE_TENSOR_CORES
-    // Half of: target = target times transposed b
-    auto multiply = [=](double* target, const double* b, int half) {
-        double sum[2][4][2] = {};
-        add_tiles(sum, target + 512 * half, b);
-        __syncwarp();  // all have read what is overwritten now
-        #pragma unroll
-        for (int m = 0; m < 2; ++m)
-            #pragma unroll
-            for (int n = 0; n < 4; ++n)
-                *reinterpret_cast<double2*>(
-                    target + 512 * half + (8 * m + row) * 32 + 8 * n + column)
-                    = make_double2(sum[m][n][0], sum[m][n][1]);
-    };
     auto add_entries = [=](double (&sum)[2][4][2], int r, int c, int half) {
         const int* from = sources_of(r, c);
         if (from == nullptr)
@@ -218,23 +204,46 @@ _FACTORISE = (
                 sum[m][n][1] -= value_of(source.y);
             }
     };
+    // Half of: target = what tile (r, c) begins with, less the products of its row with row c
+    auto begin = [=](double* target, int r, int c, int half, int count) {
+        double sum[2][4][2] = {};
+        gather(sum, r, c, half);
+        add_entries(sum, r, c, half);
+        subtract(sum, target, tiles_of(r), tiles_of(c), count, half);
+    };
+#else
+    auto begin = [=](double* target, int r, int c, int count) {
+        const int* from = sources_of(r, c);
+        subtract(target, tiles_of(r), tiles_of(c), count, [=](int i, int j) {
+            return gathered(r, c, i, j) + (from ? value_of(from[32 * i + j]) : 0.0);
+        });
+    };
+#endif
+"""
+)
+
+_DIVIDE = """
+#ifdef PALPATE_TENSOR_CORES
+    // Half of: target = target times transposed b
+    auto multiply = [=](double* target, const double* b, int half) {
+        double sum[2][4][2] = {};
+        add_tiles(sum, target + 512 * half, b);
+        __syncwarp();  // all have read what is overwritten now
+        #pragma unroll
+        for (int m = 0; m < 2; ++m)
+            #pragma unroll
+            for (int n = 0; n < 4; ++n)
+                *reinterpret_cast<double2*>(
+                    target + 512 * half + (8 * m + row) * 32 + 8 * n + column)
+                    = make_double2(sum[m][n][0], sum[m][n][1]);
+    };
     __shared__ double exchange[2][2][32];
     constexpr int warps = WP_TILE_BLOCK_DIM / 32, each = 32 / warps;
     const int warp = thread / 32;
-    bool all_good = true;
-    for (int c = 0; c < own; ++c) {
-        double* diagonal = tiles_of(c) + 1024 * c;
-        for (int half = 2 * c + warp; half < 2 * rows; half += warps) {
-            double* first = tiles_of(half / 2);
-            double sum[2][4][2] = {};
-            gather(sum, half / 2, c, half % 2);
-            add_entries(sum, half / 2, c, half % 2);
-            subtract(sum, first + 1024 * c, first, tiles_of(c), c, half % 2);
-        }
-        __syncthreads();
-        // Every thread has some numbers of a row. Up to column k they are the inverse factor's,
-        // which needs no room before; beyond, what elimination has left of the matrix.
-        double mine[each];
+    // The inverse factor of a diagonal tile, by a block of threads; false: a pivot is not positive.
+    // Every thread has some numbers of a row. Up to column k they are the inverse factor's,
+    // which needs no room before; beyond, what elimination has left of the matrix.
+    auto invert = [=](double (&mine)[each], const double* diagonal) {
         #pragma unroll
         for (int t = 0; t < each; ++t)
             mine[t] = diagonal[32 * lane + warp + warps * t];
@@ -268,32 +277,19 @@ _FACTORISE = (
                     mine[t] = lane == k ? other : before;
             }
         }
+        return good;
+    };
+    auto put = [=](double* to, const double (&mine)[each], bool good) {
         #pragma unroll
         for (int t = 0; t < each; ++t) {
             const int j = warp + warps * t;
-            diagonal[32 * lane + j] = good ? mine[t] : (j == lane ? 1.0 : 0.0);
+            to[32 * lane + j] = good ? mine[t] : (j == lane ? 1.0 : 0.0);
         }
-        all_good = all_good && good;
-        __syncthreads();
-        for (int half = 2 * c + 2 + warp; half < 2 * rows; half += warps)
-            multiply(tiles_of(half / 2) + 1024 * c, diagonal, half % 2);
-        __syncthreads();
-    }
-    if (thread == 0 && !all_good)
-        bad.data[slot] = 1;
+    };
 #else
-    if (thread != 0)
-        return;
-    for (int c = 0; c < own; ++c) {
-        double* diagonal = tiles_of(c) + 1024 * c;
+    auto invert = [](double* to, const double* diagonal) {
         double factor[1024] = {}, inverse[1024] = {};
         bool good = true;
-        for (int r = c; r < rows; ++r) {
-            const int* from = sources_of(r, c);
-            subtract(tiles_of(r) + 1024 * c, tiles_of(r), tiles_of(c), c, [=](int i, int j) {
-                return gathered(r, c, i, j) + (from ? value_of(from[32 * i + j]) : 0.0);
-            });
-        }
         for (int j = 0; j < 32; ++j)
             for (int i = j; i < 32; ++i) {
                 double sum = diagonal[32 * i + j];
@@ -311,21 +307,126 @@ _FACTORISE = (
                 inverse[32 * i + j] = sum / factor[32 * i + i];
             }
         for (int i = 0; i < 1024; ++i)
-            diagonal[i] = good ? inverse[i] : (i % 33 == 0 ? 1.0 : 0.0);
-        if (!good)
-            bad.data[slot] = 1;
-        for (int r = c + 1; r < rows; ++r) {
-            double* tile = tiles_of(r) + 1024 * c;
-            for (int i = 0; i < 32; ++i) {
-                double answer[32] = {};
-                for (int j = 0; j < 32; ++j)
-                    for (int k = 0; k <= j; ++k)
-                        answer[j] += tile[32 * i + k] * diagonal[32 * j + k];
-                for (int j = 0; j < 32; ++j)
-                    tile[32 * i + j] = answer[j];
-            }
+            to[i] = good ? inverse[i] : (i % 33 == 0 ? 1.0 : 0.0);
+        return good;
+    };
+    auto multiply = [](double* target, const double* b) {
+        for (int i = 0; i < 32; ++i) {
+            double answer[32] = {};
+            for (int j = 0; j < 32; ++j)
+                for (int k = 0; k <= j; ++k)
+                    answer[j] += target[32 * i + k] * b[32 * j + k];
+            for (int j = 0; j < 32; ++j)
+                target[32 * i + j] = answer[j];
         }
+    };
+#endif
+"""
+
+_FACTORISE = (
+    _PANEL
+    + _DIVIDE
+    + """
+    bool all_good = true;
+#ifdef PALPATE_TENSOR_CORES
+    for (int c = 0; c < own; ++c) {
+        double* diagonal = tiles_of(c) + 1024 * c;
+        for (int half = 2 * c + warp; half < 2 * rows; half += warps)
+            begin(tiles_of(half / 2) + 1024 * c, half / 2, c, half % 2, c);
+        __syncthreads();
+        double mine[each];
+        const bool good = invert(mine, diagonal);
+        put(diagonal, mine, good);
+        all_good = all_good && good;
+        __syncthreads();
+        for (int half = 2 * c + 2 + warp; half < 2 * rows; half += warps)
+            multiply(tiles_of(half / 2) + 1024 * c, diagonal, half % 2);
+        __syncthreads();
     }
+#else
+    if (thread != 0)
+        return;
+    for (int c = 0; c < own; ++c) {
+        double* diagonal = tiles_of(c) + 1024 * c;
+        for (int r = c; r < rows; ++r)
+            begin(tiles_of(r) + 1024 * c, r, c, c);
+        all_good = invert(diagonal, diagonal) && all_good;
+        for (int r = c + 1; r < rows; ++r)
+            multiply(tiles_of(r) + 1024 * c, diagonal);
+    }
+#endif
+    if (thread == 0 && !all_good)
+        bad.data[slot] = 1;
+"""
+)
+
+_BEGIN_TILE = (
+    _PANEL
+    + """
+    double* target = r + c > 0 ? tiles_of(r) + 1024 * c : diagonals.data + size_t(diagonal) * 1024;
+#ifdef PALPATE_TENSOR_CORES
+    begin(target, r, c, thread / 32, 0);
+#else
+    if (thread == 0)
+        begin(target, r, c, 0);
+#endif
+"""
+)
+
+_DIVIDE_COLUMN = (
+    _PRODUCTS
+    + FRONT
+    + _DIVIDE
+    + """
+    const double* from = diagonals.data + size_t(diagonal) * 1024;
+    double* to = tiles_of(c) + 1024 * c;
+#ifdef PALPATE_TENSOR_CORES
+    __shared__ __align__(16) double inverse[1024];
+    double mine[each];
+    const bool good = invert(mine, from);
+    put(inverse, mine, good);
+    if (part == 0)
+        put(to, mine, good);
+    __syncthreads();
+    for (int half = 2 * c + 2 + part * warps + warp; half < 2 * rows; half += parts * warps)
+        multiply(tiles_of(half / 2) + 1024 * c, inverse, half % 2);
+    if (part == 0 && thread == 0 && !good)
+        bad.data[slot] = 1;
+#else
+    if (part > 0 || thread > 0)
+        return;
+    if (!invert(to, from))
+        bad.data[slot] = 1;
+    for (int r = c + 1; r < rows; ++r)
+        multiply(tiles_of(r) + 1024 * c, to);
+#endif
+"""
+)
+
+_SUBTRACT_COLUMN = (
+    _PRODUCTS
+    + FRONT
+    + """
+    double* tile = tiles_of(r) + 1024 * j;
+    const double* a = tiles_of(r) + 1024 * c;
+    const double* b = tiles_of(j) + 1024 * c;
+    double* target
+        = r == c + 1 && j == c + 1 ? diagonals.data + size_t(diagonal) * 1024 : tile;
+#ifdef PALPATE_TENSOR_CORES
+    const int half = thread / 32;
+    double sum[2][4][2];
+    #pragma unroll
+    for (int m = 0; m < 2; ++m)
+        #pragma unroll
+        for (int n = 0; n < 4; ++n) {
+            const double2 before = pair_at(tile + 512 * half + (8 * m + row) * 32 + 8 * n + column);
+            sum[m][n][0] = -before.x;
+            sum[m][n][1] = -before.y;
+        }
+    subtract(sum, target, a, b, 1, half);
+#else
+    if (thread == 0)
+        subtract(target, a, b, 1, [=](int i, int k) { return tile[32 * i + k]; });
 #endif
 """
 )
@@ -385,5 +486,76 @@ def factorise_panel(
     matrix, ``panel`` that in ``panels``, ``rows`` its rows of tiles. A diagonal tile becomes the
     inverse of its Cholesky factor; ``bad`` is set where a pivot is not positive, and a tile of ones
     on the diagonal takes its place. All threads of a block call it.
+    """
+    ...
+
+
+@wp.func_native(_BEGIN_TILE)
+def begin_tile(
+    children: wp.array2d(dtype=wp.int32),
+    rows_in_child: wp.array(dtype=wp.int32),
+    child: int,
+    last_child: int,
+    first_share: int,
+    shares: wp.array3d(dtype=wp.float64),
+    sources_at: wp.array(dtype=wp.int32),
+    sources: wp.array(dtype=wp.int32),
+    first_tile: int,
+    values: wp.array2d(dtype=wp.float64),
+    slot: int,
+    panels: wp.array3d(dtype=wp.float64),
+    panel: int,
+    own: int,
+    r: int,
+    c: int,
+    diagonals: wp.array3d(dtype=wp.float64),
+    diagonal: int,
+    thread: int,
+):
+    """Gather tile (r, c) of a front's panel; the first one into ``diagonals``. For two warps.
+
+    With `divide_column` and `subtract_column` for each column after it, the same numbers in the
+    same order as `factorise_panel`, to the bit, by as many blocks of threads as there are.
+    """
+    ...
+
+
+@wp.func_native(_DIVIDE_COLUMN)
+def divide_column(
+    panels: wp.array3d(dtype=wp.float64),
+    panel: int,
+    own: int,
+    rows: int,
+    c: int,
+    diagonals: wp.array3d(dtype=wp.float64),
+    diagonal: int,
+    part: int,
+    parts: int,
+    slot: int,
+    bad: wp.array(dtype=wp.int32),
+    thread: int,
+):
+    """Invert the factor of a diagonal tile, which is in ``diagonals``; divide the column below.
+
+    For ``parts`` blocks of threads, each of which inverts it, since to wait for one takes longer.
+    """
+    ...
+
+
+@wp.func_native(_SUBTRACT_COLUMN)
+def subtract_column(
+    panels: wp.array3d(dtype=wp.float64),
+    panel: int,
+    own: int,
+    c: int,
+    r: int,
+    j: int,
+    diagonals: wp.array3d(dtype=wp.float64),
+    diagonal: int,
+    thread: int,
+):
+    """Subtract column c's product from tile (r, j); the next diagonal's goes into ``diagonals``.
+
+    For two warps.
     """
     ...

@@ -114,6 +114,8 @@ class BatchedFactor:
         *,
         slots: int,
         device: str,
+        few: int | None = None,
+        columns: int = 8,
     ) -> None:
         """Plan the elimination and make room.
 
@@ -123,6 +125,9 @@ class BatchedFactor:
             groups: Node of each unknown, (n,).
             slots: Number of matrices.
             device: A Warp device.
+            few: Of levels with at most so many fronts in all slots, wide ones are factorised
+                column by column; None = a quarter of the device's processors. Changes no bit.
+            columns: From so many tiles on a front is wide.
         """
         tiles = FrontTiles(
             plan_elimination(np.asarray(indptr), np.asarray(indices), np.asarray(groups))
@@ -133,6 +138,10 @@ class BatchedFactor:
         self._known = wp.full((slots, len(indices)), np.nan, dtype=wp.float64, device=device)
         self._launch = Launches(device)
         self._processors = wp.get_device(device).sm_count if self.values.device.is_cuda else 0
+        self.few = self._processors // 4 if few is None else few
+        self._by_columns = [
+            tiles.own_tiles[tiles.level == level].max() >= columns for level in range(tiles.levels)
+        ]
         self.bad = wp.zeros(slots, dtype=wp.int32, device=device)
         self.marked = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
         square = (TILE, TILE)
@@ -142,6 +151,7 @@ class BatchedFactor:
         self._shares = wp.zeros(
             (slots * tiles.share_tiles, *square), dtype=wp.float64, device=device
         )
+        self._diagonals = wp.zeros((self.few, *square), dtype=wp.float64, device=device)
         self._work = wp.zeros((slots * tiles.rows, LANES), dtype=wp.float64, device=device)
         self._fronts = self._ints(tiles.fronts)
         self._children = self._ints(tiles.children)
@@ -172,20 +182,56 @@ class BatchedFactor:
         plan = [self._fronts, self._children, self._rows_in_child]
         for level in range(tiles.levels):
             first, last = self._front_begins[level : level + 2]
-            self._launch(
-                kernels.factorise_panels,
-                (last - first, count, block := self._block((last - first) * count)),
-                [slots, self.marked, self._by_level, *plan, self._sources_at, self._sources, first,
-                 *sizes, self.values, self._shares],
-                [self._panels, self.bad],
-                block=block,
-            )  # fmt: skip
+            begin = [slots, self.marked, self._by_level, *plan, self._sources_at, self._sources,
+                     first]  # fmt: skip
+            known = [*sizes, self.values, self._shares]
+            if self._by_columns[level] and (last - first) * count <= self.few:
+                self._factorise_by_columns(level, slots, begin, known)
+            else:
+                self._launch(
+                    kernels.factorise_panels,
+                    (last - first, count, block := self._block((last - first) * count)),
+                    [*begin, *known],
+                    [self._panels, self.bad],
+                    block=block,
+                )
             first, last = self._product_begins[level : level + 2]
             self._launch(
                 kernels.subtract_products,
                 (count, last - first, 2 * TILE),
                 [slots, self.marked, self._products, *plan, first, *sizes, self._panels],
                 [self._shares],
+            )
+
+    def _factorise_by_columns(
+        self, level: int, slots: wp.array, begin: list[Any], known: list[Any]
+    ) -> None:
+        """Factorise panels column by column, each by as many blocks of threads as it can use."""
+        first, last = self._front_begins[level : level + 2]
+        of_level = self.tiles.fronts[self.tiles.level == level]
+        width, height = int(of_level[:, 0].max()), int(of_level[:, 1].max())
+        shape = (last - first, len(slots))
+        fronts = [slots, self.marked, self._by_level, self._fronts, first]
+        self._launch(
+            kernels.begin_panels,
+            (*shape, width * height, 2 * TILE),
+            [*begin, width, *known],
+            [self._panels, self._diagonals],
+        )
+        for column in range(width):
+            below = height - column - 1
+            parts = max(1, -(-2 * below * TILE // THREADS))
+            self._launch(
+                kernels.divide_columns,
+                (*shape, parts, THREADS),
+                [*fronts, column, parts, self.tiles.panel_tiles, self._diagonals],
+                [self._panels, self.bad],
+            )
+            self._launch(
+                kernels.subtract_columns,
+                (*shape, (width - column - 1) * below, 2 * TILE),
+                [*fronts, column, width, self.tiles.panel_tiles],
+                [self._panels, self._diagonals],
             )
 
     def _block(self, fronts: int) -> int:

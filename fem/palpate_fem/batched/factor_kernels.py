@@ -106,6 +106,97 @@ def factorise_panels(
 
 
 @wp.kernel(launch_bounds=(THREADS, 2))
+def begin_panels(
+    slots: wp.array(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
+    listed: wp.array(dtype=wp.int32),
+    fronts: wp.array2d(dtype=wp.int32),
+    children: wp.array2d(dtype=wp.int32),
+    rows_in_child: wp.array(dtype=wp.int32),
+    sources_at: wp.array(dtype=wp.int32),
+    sources: wp.array(dtype=wp.int32),
+    first: int,
+    width: int,
+    panel_tiles: int,
+    share_tiles: int,
+    values_in: wp.array2d(dtype=wp.float64),
+    shares_in: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float64),
+    diagonals: wp.array3d(dtype=wp.float64),
+):
+    """Gather the own columns of fronts, at most ``width`` of tiles: two warps for a tile."""
+    number, i, tile, thread = wp.tid()
+    slot = slots[i]
+    front = listed[first + number]
+    own = fronts[front, 0]
+    r = tile // width
+    c = tile % width
+    if marked[slot, front] != 0 and c < own and c <= r and r < fronts[front, 1]:
+        first_tile = fronts[front, 4]
+        dense_tiles.begin_tile(
+            children, rows_in_child, fronts[front, 2], fronts[front, 3], slot * share_tiles,
+            shares_in, sources_at, sources, first_tile, values_in, slot,
+            panels, slot * panel_tiles + first_tile, own, r, c,
+            diagonals, number * slots.shape[0] + i, thread,
+        )  # fmt: skip
+
+
+@wp.kernel(launch_bounds=(THREADS, 1))
+def divide_columns(
+    slots: wp.array(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
+    listed: wp.array(dtype=wp.int32),
+    fronts: wp.array2d(dtype=wp.int32),
+    first: int,
+    column: int,
+    parts: int,
+    panel_tiles: int,
+    diagonals_in: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float64),
+    bad: wp.array(dtype=wp.int32),
+):
+    """Factorise the diagonal tile of a column of fronts, and divide by it what is below."""
+    number, i, part, thread = wp.tid()
+    slot = slots[i]
+    front = listed[first + number]
+    own = fronts[front, 0]
+    if marked[slot, front] != 0 and column < own:
+        panel = slot * panel_tiles + fronts[front, 4]
+        dense_tiles.divide_column(
+            panels, panel, own, fronts[front, 1], column,
+            diagonals_in, number * slots.shape[0] + i, part, parts, slot, bad, thread,
+        )  # fmt: skip
+
+
+@wp.kernel(launch_bounds=(THREADS, 2))
+def subtract_columns(
+    slots: wp.array(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
+    listed: wp.array(dtype=wp.int32),
+    fronts: wp.array2d(dtype=wp.int32),
+    first: int,
+    column: int,
+    width: int,
+    panel_tiles: int,
+    panels: wp.array3d(dtype=wp.float64),
+    diagonals: wp.array3d(dtype=wp.float64),
+):
+    """Subtract a column's products from the columns after it: two warps for a tile."""
+    number, i, tile, thread = wp.tid()
+    slot = slots[i]
+    front = listed[first + number]
+    own = fronts[front, 0]
+    left = width - column - 1
+    r = column + 1 + tile // left
+    j = column + 1 + tile % left
+    if marked[slot, front] != 0 and j < own and j <= r and r < fronts[front, 1]:
+        dense_tiles.subtract_column(
+            panels, slot * panel_tiles + fronts[front, 4], own, column, r, j,
+            diagonals, number * slots.shape[0] + i, thread,
+        )  # fmt: skip
+
+
+@wp.kernel(launch_bounds=(THREADS, 2))
 def subtract_products(
     slots: wp.array(dtype=wp.int32),
     marked: wp.array2d(dtype=wp.int32),
