@@ -109,7 +109,7 @@ def agreement(rows: list[dict[str, Any]], folder: Path) -> str:
 
 def kernels(runs: list[dict[str, Any]]) -> str:
     """Where the time of a factorisation and of a solve goes."""
-    names = list(runs[-1]["kernels_ms"])
+    names = dict.fromkeys(name for run in reversed(runs) for name in run["kernels_ms"])
     head = ["kernel", *(f"slots: {run['slots']} [ms]" for run in runs)]
     rows = [[name, *(show(run["kernels_ms"].get(name)) for run in runs)] for name in names]
     whole = [

@@ -97,7 +97,7 @@ def fingertip_settings(parameters: FingertipParameters) -> dict[str, float | Non
 
 
 def _mesh_options(spec: ExperimentSpec) -> dict[str, object]:
-    return {"layers": 2, "edge_m": spec.edge_m, "solver": dict(SOLVER)}
+    return {"layers": spec.layers, "edge_m": spec.edge_m, "solver": dict(SOLVER)}
 
 
 def specimens_of(members: Iterable[Member]) -> tuple[Specimen, ...]:

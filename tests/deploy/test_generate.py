@@ -295,12 +295,14 @@ def test_the_command_takes_points_a_seed_and_specimens(tmp_path: Path) -> None:
     write_population(units, draw_members(2, 3), source="drawn")
     words = ["generate", str(out), "--points", "1", "--angled", "0", "--seed", "11"]
     words += ["--units", str(units), "--edge-mm", "1.2", "--indenter", "sphere_medium"]
-    words += ["--registration-seed", "0"]
+    words += ["--registration-seed", "0", "--layers", "1"]
     done = CliRunner().invoke(twin_app, [*words, "--workers", "1"])
     assert done.exit_code == 0, done.output
     spec = json.loads((out / SPEC_FILE).read_text())["spec"]
     assert (spec["points"], spec["angled"], spec["seed"]) == (1, 0, 11)
-    assert spec["registration_seed"] == 0
+    assert (spec["registration_seed"], spec["layers"]) == (0, 1)
+    mesh = SimulationStore.open(out / STORE).fingertip().mesh
+    assert len(mesh.elements) == len(mesh.outer_faces)
     assert read_mixed(out / MIXED).experiment.unit_names == ("unit-001", "unit-002")
 
 

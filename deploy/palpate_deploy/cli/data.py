@@ -155,6 +155,9 @@ def data_generate(
         ),
     ] = None,
     edge_mm: Annotated[float, typer.Option(help="Edge of the mesh on the pad [mm].")] = 0.6,
+    layers: Annotated[
+        int, typer.Option(min=1, help="Elements through the skin; 4 hold in the deepest pinch.")
+    ] = 2,
     fill_ml: Annotated[
         float | None, typer.Option(help="Fluid under the skin [ml] [default: 0.6].")
     ] = None,
@@ -224,6 +227,7 @@ def data_generate(
         seed=seed,
         registration_seed=registration_seed,
         edge_m=edge_mm * 1e-3,
+        layers=layers,
         fluid_volume_m3=fill_m3,
         indenters=tuple(make_indenter(name).name for name in indenter or ()),
         paths=tuple(show_segments(parse_segments(words)) for words in path or ()),

@@ -33,6 +33,9 @@ FLUID_VOLUME_M3 = 6.0e-7
 EDGE_M = 0.6e-3
 """Edge of the mesh on the pad [m]; the mesh study puts its force error below 1 %."""
 
+LAYERS = 2
+"""Elements through the skin."""
+
 SKIN = ("skin_thickness_m", "shear_modulus_pa", "friction_coefficient")
 """Settings of an experiment that say what its skin is."""
 
@@ -66,6 +69,7 @@ class ExperimentSpec:
         friction_coefficient: Between indenter and skin.
         registration_seed: Of the robots' registration; None = ``seed``. Experiments of the same
             specimens with the same one are by robots that stand equally wrong.
+        layers: Elements through the skin.
     """
 
     points: int = 10
@@ -82,6 +86,7 @@ class ExperimentSpec:
     shear_modulus_pa: float | None = None
     friction_coefficient: float | None = None
     registration_seed: int | None = None
+    layers: int = LAYERS
 
     def content(self) -> dict[str, Any]:
         """As plain values; those that came later only where they are used."""
@@ -90,6 +95,7 @@ class ExperimentSpec:
             "paths": (),
             "presses": 0,
             "units_each": 0,
+            "layers": LAYERS,
             **dict.fromkeys((*SKIN, "registration_seed")),
         }
         return {
