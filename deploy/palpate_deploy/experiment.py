@@ -91,9 +91,10 @@ def parameters_of(spec: ExperimentSpec) -> FingertipParameters:
     return FingertipParameters(fluid_volume_m3=spec.fluid_volume_m3, **given)
 
 
-def fingertip_settings(parameters: FingertipParameters) -> dict[str, float | None]:
-    """A drawn fingertip as settings of an experiment."""
-    return {name: getattr(parameters, name) for name in (*SKIN, "fluid_volume_m3")}
+def fingertip_settings(parameters: FingertipParameters) -> dict[str, float]:
+    """A drawn fingertip as settings of an experiment, without what is not drawn."""
+    values = {name: getattr(parameters, name) for name in (*SKIN, "fluid_volume_m3")}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _mesh_options(spec: ExperimentSpec) -> dict[str, object]:

@@ -19,6 +19,7 @@ LIMITS = {
     "total_thickness_m": (13.7e-3, 16.0e-3),
     "fluid_volume_m3": (0.0, 2.0e-6),
     "bulk_ratio": (1e1, 1e7),
+    "strain_stiffening": (1e-6, 0.1),
 }
 
 
@@ -28,12 +29,15 @@ class FingertipParameters:
 
     Attributes:
         skin_thickness_m: Thickness t_s of the unpressurised skin [m].
-        shear_modulus_pa: Neo-Hookean modulus mu [Pa].
+        shear_modulus_pa: Shear modulus mu of the skin [Pa], of small strains if it stiffens.
         friction_coefficient: Coulomb coefficient between indenter and skin.
         total_thickness_m: Dorso-ventral extent of the pressurised skin [m]; the fluid is filled in
             until it is reached (paper, "Finite element model configuration").
         fluid_volume_m3: Fluid between skin and core [m^3]; None = what total_thickness_m needs.
         bulk_ratio: Bulk modulus over mu; large enough that its value does not matter.
+        strain_stiffening: By how much of mu the skin has become stiffer where m = I1 - 3 is 1; it
+            grows with m^2 (Yeoh 1993 with C2 = 0: 3 C3 / C1). None = it does not: neo-Hooke, as the
+            paper has it. Soft silicones have 0.004 and more.
 
     Raises:
         ConfigError: A value is not finite or out of range; names it and its limits.
@@ -45,6 +49,7 @@ class FingertipParameters:
     total_thickness_m: float = 15.1e-3
     fluid_volume_m3: float | None = None
     bulk_ratio: float = 1e4
+    strain_stiffening: float | None = None
 
     def __post_init__(self) -> None:
         for name, (low, high) in LIMITS.items():

@@ -295,14 +295,15 @@ def test_the_command_takes_points_a_seed_and_specimens(tmp_path: Path) -> None:
     write_population(units, draw_members(2, 3), source="drawn")
     words = ["generate", str(out), "--points", "1", "--angled", "0", "--seed", "11"]
     words += ["--units", str(units), "--edge-mm", "1.2", "--indenter", "sphere_medium"]
-    words += ["--registration-seed", "0", "--layers", "1"]
+    words += ["--registration-seed", "0", "--layers", "1", "--strain-stiffening", "0.01"]
     done = CliRunner().invoke(twin_app, [*words, "--workers", "1"])
     assert done.exit_code == 0, done.output
     spec = json.loads((out / SPEC_FILE).read_text())["spec"]
     assert (spec["points"], spec["angled"], spec["seed"]) == (1, 0, 11)
     assert (spec["registration_seed"], spec["layers"]) == (0, 1)
-    mesh = SimulationStore.open(out / STORE).fingertip().mesh
-    assert len(mesh.elements) == len(mesh.outer_faces)
+    fingertip = SimulationStore.open(out / STORE).fingertip()
+    assert len(fingertip.mesh.elements) == len(fingertip.mesh.outer_faces)
+    assert fingertip.parameters.strain_stiffening == spec["strain_stiffening"] == 0.01
     assert read_mixed(out / MIXED).experiment.unit_names == ("unit-001", "unit-002")
 
 
@@ -311,7 +312,7 @@ def test_fingertips_have_skins_presses_and_specimens_of_their_own(tmp_path: Path
     write_population(units, draw_members(4, 3), source="drawn")
     words = ["generate", str(out), "--random", "5", "--fingertips", "2", "--units", str(units)]
     words += ["--units-each", "1", "--edge-mm", "1.2", "--indenter", "sphere_medium"]
-    words += ["--workers", "1", "--json"]
+    words += ["--workers", "1", "--strain-stiffening", "0.01", "--json"]
     done = runner.invoke(twin_app, words)
     assert done.exit_code == 0, done.output
     one, other = (out / "fingertip-01", out / "fingertip-02")
@@ -322,6 +323,7 @@ def test_fingertips_have_skins_presses_and_specimens_of_their_own(tmp_path: Path
     skin = SimulationStore.open(other / STORE).fingertip()
     assert skin.parameters.shear_modulus_pa == specs[1]["shear_modulus_pa"]
     assert skin.parameters.friction_coefficient == specs[1]["friction_coefficient"]
+    assert skin.parameters.strain_stiffening == 0.01  # which is not drawn
     parts = [read_mixed(tip / MIXED) for tip in (one, other)]
     assert parts[0].experiment.unit_names == ("unit-001", "unit-002")
     assert parts[1].experiment.unit_names == ("unit-003", "unit-004")

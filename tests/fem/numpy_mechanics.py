@@ -20,20 +20,22 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class NeoHooke:
+class Rubber:
     """Energy, first Piola stress and tangent; ``f`` are deformation gradients, (..., 3, 3).
 
     Attributes:
         mu: Shear modulus [Pa].
         barrier: Stiffness against a change of volume at a single point, in shear moduli; 0 = none.
+        stiffening: See `FingertipParameters`; 0 = neo-Hooke.
     """
 
     mu: float
     barrier: float = VOLUME_BARRIER
+    stiffening: float = 0.0
 
     def function(self, f: Floats) -> Floats:
         """Energy per unit of undeformed volume [J/m^3], shape (...)."""
-        return energy_density(f, self.mu, self.barrier)
+        return energy_density(f, self.mu, self.barrier, self.stiffening)
 
     def gradient(self, f: Floats) -> Floats:
         """First Piola stress dW/dF [Pa], shape (..., 3, 3)."""
@@ -53,10 +55,19 @@ class NeoHooke:
         identity = np.einsum("ik,jl->ijkl", eye, eye)
         beyond, sign = self._beyond(np.linalg.det(f)[..., None, None, None, None])
         volumetric = (beyond > 0.0) * gg - sign * beyond * swapped
+        power = np.linalg.det(f)[..., None, None] ** (-2 / 3)
+        slope = 2 * power * (f - np.sum(f * f, axis=(-2, -1))[..., None, None] / 3 * g)
+        growth = self.mu * self.stiffening * self._stretch(f)[..., None, None, None, None]
         return np.asarray(
             scale * (identity - 2 / 3 * fg + 2 / 9 * trace * gg + trace / 3 * swapped)
+            + growth * np.einsum("...ij,...kl->...ijkl", slope, slope)
             + self.mu * self.barrier * volumetric
         )
+
+    @staticmethod
+    def _stretch(f: Floats) -> Floats:
+        """M = J^(-2/3) tr(F^T F) - 3, shape (...)."""
+        return np.asarray(np.linalg.det(f) ** (-2 / 3) * np.sum(f * f, axis=(-2, -1)) - 3)
 
     @staticmethod
     def _beyond(j: Floats) -> tuple[Floats, Floats]:
@@ -66,11 +77,12 @@ class NeoHooke:
         return np.asarray(beyond), np.asarray(np.sign(logarithm))
 
     def _parts(self, f: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return mu J^(-2/3), tr(F^T F) and F^-T."""
+        """Return mu J^(-2/3) (1 + stiffening m^2), tr(F^T F) and F^-T."""
         j = np.linalg.det(f)[..., None, None]
         trace = np.sum(f * f, axis=(-2, -1))[..., None, None]
         inverse_t = np.asarray(np.linalg.inv(f).swapaxes(-1, -2), np.float64)
-        return np.asarray(self.mu * j ** (-2 / 3)), np.asarray(trace), inverse_t
+        stiff = 1 + self.stiffening * self._stretch(f)[..., None, None] ** 2
+        return np.asarray(self.mu * stiff * j ** (-2 / 3)), np.asarray(trace), inverse_t
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +109,7 @@ class Elements:
 
 
 def elements(
-    mesh: SolidMesh, material: NeoHooke, bulk: float, position: Floats, pressure: Floats
+    mesh: SolidMesh, material: Rubber, bulk: float, position: Floats, pressure: Floats
 ) -> Elements:
     """Evaluate all elements.
 

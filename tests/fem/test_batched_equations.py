@@ -45,7 +45,7 @@ SCRATCH = ("_longest", "_fraction")  # of all slots, whichever are listed
 @pytest.fixture(scope="module")
 def finger(fill: Fill) -> Fingertip:
     """For this module alone: its system keeps what belongs to the last tangent."""
-    return fill()
+    return fill(strain_stiffening=0.1)
 
 
 @pytest.fixture(scope="module")

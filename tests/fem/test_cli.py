@@ -207,6 +207,7 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
         (("--angle-deg", 90), "angle-deg"),
         (("--indenter", "cube", "--indenter", "ring"), "several"),
         (("--shear-modulus-kpa", 280_000), "shear_modulus_pa"),
+        (("--strain-stiffening", 0.5), "strain_stiffening"),
         (("--mesh", "nowhere"), "nowhere"),
         (("--poses", "nowhere.csv"), "nowhere.csv"),
         (("--path", "nowhere.csv"), "--poses"),

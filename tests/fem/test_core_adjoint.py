@@ -60,7 +60,7 @@ STEPS = {
 
 @dataclass(frozen=True)
 class Scene:
-    """What is pressed how: radius of the core [m], fluid [m^3], friction, and the poses.
+    """What is pressed how: radius of the core [m], fluid [m^3], friction, poses, and what skin.
 
     Each pose is a depth of the tip beyond the untouched skin, its place beside the axis [m], and
     its turn about the axis of the finger and its own [rad].
@@ -70,6 +70,7 @@ class Scene:
     fluid_m3: float
     friction: float
     poses: tuple[tuple[float, float, float, float, float], ...]
+    stiffening: float | None = None
 
 
 SCENES = {
@@ -88,7 +89,7 @@ SCENES = {
         (-2e-6, 0.3e-3, 0.0, 0.0, 0.0),
         (0.6e-3, 0.4e-3, 0.05e-3, 0.0, 0.0),
         (0.85e-3, 0.5e-3, 0.1e-3, 0.0, 0.0),
-    )),
+    ), stiffening=0.1),
 }  # fmt: skip
 
 
@@ -121,7 +122,8 @@ class Simulations:
             "shear_modulus_pa": 2.8e5,
         }
         values = {name: value + changes.get(name, 0.0) for name, value in plain.items()}
-        return Fingertip.pressurised(geometry, FingertipParameters(**values), self.settings)
+        parameters = FingertipParameters(**values, strain_stiffening=scene.stiffening)
+        return Fingertip.pressurised(geometry, parameters, self.settings)
 
     def run(self, path: Floats | None = None, **changes: float) -> tuple[Fingertip, History]:
         """The same indentation; the last step of the slide, which turns, in two increments."""

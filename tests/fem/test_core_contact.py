@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 from numpy.typing import NDArray
 from tests.fem.numpy_indenter import distance
-from tests.fem.numpy_mechanics import Contact, ContactLaw, NeoHooke, contact, elements, return_map
+from tests.fem.numpy_mechanics import Contact, ContactLaw, Rubber, contact, elements, return_map
 
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import ContactSettings, ContactSurface, PosedIndenter
@@ -99,7 +99,7 @@ class Pressed:
     def settle(self) -> None:
         """Give all pressures and tractions the values that belong to the positions."""
         mesh, state, bulk = self.system.mesh, self.state, BULK_RATIO * MU
-        skin = elements(mesh, NeoHooke(MU), bulk, state.position, state.pressure)
+        skin = elements(mesh, Rubber(MU), bulk, state.position, state.pressure)
         state.pressure = bulk * (skin.volume / skin.rest_volume - 1.0)
         gap = self.core.grid.evaluate(self.points(self.system.inner, mesh.inner_faces))[0]
         pressure = np.maximum(0.0, -SOFT.stiffness * (gap + state.on_core.gap.ravel()))
@@ -234,7 +234,7 @@ def test_condensed_loads_and_updates_equal_the_twin(squeeze: Squeeze) -> None:
     # The skin's own misfit is tested with the elements.
     system.balance(state, pressed.press)
     system.tangent_values()
-    skin = elements(mesh, NeoHooke(MU), BULK_RATIO * MU, state.position, state.pressure)
+    skin = elements(mesh, Rubber(MU), BULK_RATIO * MU, state.position, state.pressure)
     state.pressure = BULK_RATIO * MU * (skin.volume / skin.rest_volume - 1.0)
     (out, _), core = pressed.outside(), pressed.inside()
     load = pressed.scattered(system.outer, mesh.outer_faces, out.misfit)

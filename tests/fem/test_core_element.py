@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.fem.numpy_mechanics import Elements, NeoHooke, elements
+from tests.fem.numpy_mechanics import Elements, Rubber, elements
 
 from palpate_fem.mechanics.contact import ContactSettings
 from palpate_fem.mechanics.element_kernels import BARRIER_FROM
@@ -24,6 +24,7 @@ Dense = Callable[[EquilibriumSystem], Floats]
 SAME = 1e-12  # relative to the largest entry: kernels and twins differ by rounding
 MU, BULK_RATIO = 2.8e5, 1e4
 BOTH = pytest.mark.parametrize("corners", [8, 6])
+LAWS = pytest.mark.parametrize("stiffening", [0.0, 0.3])
 
 
 def difference(found: Floats, wanted: Floats) -> float:
@@ -31,7 +32,7 @@ def difference(found: Floats, wanted: Floats) -> float:
     return float(np.abs(found - wanted).max() / np.abs(wanted).max())
 
 
-def system_of(mesh: SolidMesh) -> EquilibriumSystem:
+def system_of(mesh: SolidMesh, stiffening: float = 0.0) -> EquilibriumSystem:
     held = np.zeros(mesh.nodes.shape, bool)
     return EquilibriumSystem(
         mesh,
@@ -39,6 +40,7 @@ def system_of(mesh: SolidMesh) -> EquilibriumSystem:
         shear_modulus_pa=MU,
         bulk_ratio=BULK_RATIO,
         contact=ContactSettings(),
+        strain_stiffening=stiffening,
         held=held,
     )
 
@@ -53,13 +55,15 @@ def strained(mesh: SolidMesh, seed: int) -> SolutionState:
     return state
 
 
-def twin(mesh: SolidMesh, state: SolutionState) -> Elements:
-    return elements(mesh, NeoHooke(MU), BULK_RATIO * MU, state.position, state.pressure)
+def twin(mesh: SolidMesh, state: SolutionState, stiffening: float = 0.0) -> Elements:
+    law = Rubber(MU, stiffening=stiffening)
+    return elements(mesh, law, BULK_RATIO * MU, state.position, state.pressure)
 
 
-def test_stress_and_stiffness_are_derivatives_of_the_energy() -> None:
+@LAWS
+def test_stress_and_stiffness_are_derivatives_of_the_energy(stiffening: float) -> None:
     random = np.random.default_rng(0)
-    law = NeoHooke(MU)
+    law = Rubber(MU, stiffening=stiffening)
     f = np.eye(3) + random.uniform(-0.3, 0.3, (20, 3, 3))
     logarithm = np.log(np.linalg.det(f))
     assert logarithm.min() < -BARRIER_FROM  # squeezed, grown and untouched points are among them
@@ -77,14 +81,14 @@ def test_stress_and_stiffness_are_derivatives_of_the_energy() -> None:
 
 def test_stress_is_zero_at_rest_turns_with_the_body_and_knows_no_volume() -> None:
     random = np.random.default_rng(1)
-    law = NeoHooke(MU)
+    law = Rubber(MU)
     f = np.eye(3) + random.uniform(-0.3, 0.3, (20, 3, 3))
     turn = np.linalg.qr(random.normal(size=(20, 3, 3)))[0]
     turn *= np.linalg.det(turn)[:, None, None]
     np.testing.assert_allclose(law.gradient(np.eye(3)), 0.0, atol=1e-10)
     np.testing.assert_allclose(law.gradient(turn @ f), turn @ law.gradient(f), atol=1e-8)
     np.testing.assert_allclose(
-        NeoHooke(MU, barrier=0.0).function(1.3 * f), NeoHooke(MU, barrier=0.0).function(f)
+        Rubber(MU, barrier=0.0).function(1.3 * f), Rubber(MU, barrier=0.0).function(f)
     )
 
 
@@ -94,10 +98,10 @@ def test_the_barrier_is_nothing_until_a_point_loses_its_volume() -> None:
     for size in (0.78, 1.0, 1.28):
         there = (size / np.linalg.det(f)[:, None, None]) ** (1 / 3) * f
         for kind in ("function", "gradient", "hessian"):
-            found = getattr(NeoHooke(MU), kind)(there)
-            np.testing.assert_allclose(found, getattr(NeoHooke(MU, barrier=0.0), kind)(there))
+            found = getattr(Rubber(MU), kind)(there)
+            np.testing.assert_allclose(found, getattr(Rubber(MU, barrier=0.0), kind)(there))
     pressed, grown = (
-        np.trace(NeoHooke(MU).gradient(scale ** (1 / 3) * np.eye(3))) for scale in (0.7, 1.4)
+        np.trace(Rubber(MU).gradient(scale ** (1 / 3) * np.eye(3))) for scale in (0.7, 1.4)
     )
     assert pressed < 0.0 < grown
 
@@ -135,16 +139,17 @@ def replace_position(state: SolutionState, position: Floats) -> SolutionState:
 
 
 @BOTH
+@LAWS
 @pytest.mark.parametrize("seed", [4, 5])
 def test_kernels_equal_the_twin(
-    shell: Mesh, assembled: Assembled, dense: Dense, corners: int, seed: int
+    shell: Mesh, assembled: Assembled, dense: Dense, corners: int, seed: int, stiffening: float
 ) -> None:
     mesh = shell(3, 2, 3e-3, 4.5e-3, corners=corners)
     random = np.random.default_rng(seed)
     mesh = replace(mesh, nodes=mesh.nodes + random.normal(0.0, 5e-5, mesh.nodes.shape))
-    state, system = strained(mesh, seed), system_of(mesh)
+    state, system = strained(mesh, seed), system_of(mesh, stiffening)
     balance = system.balance(state, None)
-    expected = twin(mesh, state)
+    expected = twin(mesh, state, stiffening)
     stiff = BULK_RATIO * MU / expected.rest_volume
     excess = expected.volume - expected.rest_volume
 

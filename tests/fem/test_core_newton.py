@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.fem.numpy_mechanics import NeoHooke, cavity, elements
+from tests.fem.numpy_mechanics import Rubber, cavity, elements
 
 from palpate.errors import SimulationError
 from palpate_fem.indenter.catalogue import make_indenter
@@ -196,7 +196,7 @@ def test_dead_loads_are_borne_by_what_is_held(block: Mesh) -> None:
     assert report.converged
     borne = balance.internal[mesh.fixed].sum(axis=0)
     np.testing.assert_allclose(borne, (-0.01, 0.02, -0.03), atol=1e-7)
-    twin = elements(mesh, NeoHooke(MU), BULK_RATIO * MU, state.position, state.pressure)
+    twin = elements(mesh, Rubber(MU), BULK_RATIO * MU, state.position, state.pressure)
     np.testing.assert_allclose(twin.force, balance.internal, atol=1e-9)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.fem.numpy_mechanics import Elements, NeoHooke, cavity, elements, mortar
+from tests.fem.numpy_mechanics import Elements, Rubber, cavity, elements, mortar
 
 from palpate.errors import SimulationError
 from palpate_fem.config import FingertipParameters
@@ -63,7 +63,7 @@ class Pressed:
         mesh, state, parameters = self.tip.geometry.mesh, self.run.at.state, self.tip.parameters
         mu = parameters.shear_modulus_pa
         kappa = parameters.bulk_ratio * mu
-        return elements(mesh, NeoHooke(mu), kappa, state.position, state.pressure)
+        return elements(mesh, Rubber(mu), kappa, state.position, state.pressure)
 
 
 @pytest.fixture(scope="module")
@@ -258,7 +258,7 @@ def test_stress_carries_the_loads(pressed: Pressed) -> None:
     state.position += random.normal(0.0, 2e-5, mesh.nodes.shape)
     for part in (np.arange(len(mesh.elements)), np.arange(5)):
         some = replace(mesh, elements=mesh.elements[part])
-        skin = elements(some, NeoHooke(mu), ratio * mu, state.position, state.pressure[part])
+        skin = elements(some, Rubber(mu), ratio * mu, state.position, state.pressure[part])
         wanted = state.position.T @ skin.force
         stress = cauchy()[part]
         xx, yy, zz, yz, xz, xy = (stress * skin.volume[:, None]).sum(axis=0)

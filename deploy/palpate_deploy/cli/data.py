@@ -155,9 +155,14 @@ def data_generate(
         ),
     ] = None,
     edge_mm: Annotated[float, typer.Option(help="Edge of the mesh on the pad [mm].")] = 0.6,
-    layers: Annotated[
-        int, typer.Option(min=1, help="Elements through the skin; 4 hold in the deepest pinch.")
-    ] = 2,
+    layers: Annotated[int, typer.Option(min=1, help="Elements through the skin.")] = 2,
+    strain_stiffening: Annotated[
+        float | None,
+        typer.Option(
+            help="Yeoh's 3 C3 / C1 of the skin, as silicone has it: 0.004 and more; with it the "
+            "deepest pinches do not snap [default: neo-Hooke]."
+        ),
+    ] = None,
     fill_ml: Annotated[
         float | None, typer.Option(help="Fluid under the skin [ml] [default: 0.6].")
     ] = None,
@@ -228,6 +233,7 @@ def data_generate(
         registration_seed=registration_seed,
         edge_m=edge_mm * 1e-3,
         layers=layers,
+        strain_stiffening=strain_stiffening,
         fluid_volume_m3=fill_m3,
         indenters=tuple(make_indenter(name).name for name in indenter or ()),
         paths=tuple(show_segments(parse_segments(words)) for words in path or ()),

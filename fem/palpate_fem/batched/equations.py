@@ -99,7 +99,7 @@ class BatchedEquations:
         # Of quadrature points: J, w P and w J F^-T.
         self._stresses = [room(kind, total, points) for kind in (wp.float64, wp.mat33d, wp.mat33d)]
         self._parts = [room(wp.vec3d, total, points, corners) for _ in range(3)]
-        self._parts.append(room(wp.vec2d, total, points))
+        self._parts.append(room(wp.vec4d, total, points))
         self._elastic = room(wp.mat33d, slots * pattern.blocks)
         self._sum = room(wp.mat33d, slots * pattern.blocks)
         self._internal, self._gradient_of_volume, self._unbalanced = (
@@ -566,8 +566,7 @@ class BatchedEquations:
 
     @property
     def _model(self) -> list[Any]:
-        skin = self.system.skin
-        constants = wp.float64(skin.mu), wp.float64(skin.volume_barrier)
+        constants = self.system.skin.constants
         return [self._elements, self._gradient, self._weight, *constants, self._nodes]
 
     @property

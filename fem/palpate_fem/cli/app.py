@@ -48,6 +48,13 @@ ThicknessOption = Annotated[
 ModulusOption = Annotated[
     float | None, typer.Option("--shear-modulus-kpa", help="Shear modulus of the skin [kPa].")
 ]
+StiffeningOption = Annotated[
+    float | None,
+    typer.Option(
+        "--strain-stiffening",
+        help="Yeoh's 3 C3 / C1 of the skin, as silicone has it: 0.004 and more; none = neo-Hooke.",
+    ),
+]
 FrictionOption = Annotated[
     float | None, typer.Option("--friction", help="Friction coefficient of indenter and skin.")
 ]
@@ -203,6 +210,7 @@ def run(
     parameters: ParametersOption = None,
     skin_thickness_mm: ThicknessOption = None,
     shear_modulus_kpa: ModulusOption = None,
+    strain_stiffening: StiffeningOption = None,
     friction: FrictionOption = None,
     fill_ml: FillOption = None,
     json_: JsonOption = False,
@@ -243,6 +251,7 @@ def run(
                 fit=parameters,
                 skin_thickness_mm=skin_thickness_mm,
                 shear_modulus_kpa=shear_modulus_kpa,
+                strain_stiffening=strain_stiffening,
                 friction=friction,
                 fill_ml=fill_ml,
             ),
@@ -461,6 +470,7 @@ def serve(
     parameters: ParametersOption = None,
     skin_thickness_mm: ThicknessOption = None,
     shear_modulus_kpa: ModulusOption = None,
+    strain_stiffening: StiffeningOption = None,
     friction: FrictionOption = None,
     fill_ml: FillOption = None,
 ) -> None:
@@ -475,6 +485,7 @@ def serve(
         fit=parameters,
         skin_thickness_mm=skin_thickness_mm,
         shear_modulus_kpa=shear_modulus_kpa,
+        strain_stiffening=strain_stiffening,
         friction=friction,
         fill_ml=fill_ml,
     )

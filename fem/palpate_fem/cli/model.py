@@ -80,6 +80,7 @@ def model_of(
     fit: Path | None = None,
     skin_thickness_mm: float | None = None,
     shear_modulus_kpa: float | None = None,
+    strain_stiffening: float | None = None,
     friction: float | None = None,
     fill_ml: float | None = None,
 ) -> FingertipModel:
@@ -110,6 +111,7 @@ def model_of(
     given = {
         "skin_thickness_m": None if skin_thickness_mm is None else skin_thickness_mm * 1e-3,
         "shear_modulus_pa": None if shear_modulus_kpa is None else shear_modulus_kpa * 1e3,
+        "strain_stiffening": strain_stiffening,
         "friction_coefficient": friction,
         "fluid_volume_m3": None if fill_ml is None else fill_ml * 1e-6,
     }

@@ -1,12 +1,14 @@
 # mypy: ignore-errors
-"""Kernels of the skin (nearly incompressible neo-Hooke) and of the fluid that it encloses.
+"""Kernels of the skin (nearly incompressible rubber) and of the fluid that it encloses.
 
 The element has linear displacements and one pressure (Q1-P0, mean dilatation; Simo, Taylor and
 Pister 1985). Its energy, with v its volume and p its pressure::
 
-    sum_q w_q mu/2 (J^(-2/3) I1 - 3 + barrier b^2)  +  p (v - v0)  -  v0 p^2 / (2 kappa)
+    sum_q w_q mu/2 (m + stiffening/3 m^3 + barrier b^2)  +  p (v - v0)  -  v0 p^2 / (2 kappa)
 
-with b = max(0, |ln J| - 0.25), the barrier of the volume. The pressure of an element keeps its
+with m = J^(-2/3) I1 - 3. The cubic is Yeoh's: rubber becomes stiffer where it is stretched to
+several times its length, which neo-Hooke does not (ADR 0013); without it the law is neo-Hooke's.
+b = max(0, |ln J| - 0.25) is the barrier of the volume. The pressure of an element keeps its
 *mean* volume, but not the volume at each of its quadrature points. Where skin is pinched between a
 hard indenter and the core, the points of one element may go to J = 0.3 beside J = 2, an hourglass
 mode that Q1-P0 does not resist, and Newton's method finds no equilibrium. The barrier resists it;
@@ -75,11 +77,17 @@ def nominal_stress(
     w: wp.float64,
     mu: wp.float64,
     barrier: wp.float64,
+    stiffening: wp.float64,
     pressure: wp.float64,
 ) -> wp.mat33d:
-    """Weighted: w P = scale (F - I1/3 F^-T) + w (p J + mu barrier b sign(ln J)) F^-T."""
-    scale = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
+    """Weighted: w P = scale (F - I1/3 F^-T) + w (p J + mu barrier b sign(ln J)) F^-T.
+
+    scale = w mu J^(-2/3) (1 + stiffening m^2)
+    """
+    power = wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
     i1 = wp.ddot(f, f)
+    m = power * i1 - wp.float64(3.0)
+    scale = w * mu * power * (wp.float64(1.0) + stiffening * m * m)
     along = w * (pressure * j + mu * barrier * beyond(j)) - scale * i1 / wp.float64(3.0)
     return scale * f + along * inverse_t
 
@@ -91,6 +99,7 @@ def element_state(
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
     barrier: wp.float64,
+    stiffening: wp.float64,
     nodes: int,
     items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
@@ -117,7 +126,7 @@ def element_state(
         w = weight[s, q]
         volume += w * j
         inverse_t = wp.transpose(wp.inverse(f))
-        stress = nominal_stress(f, j, inverse_t, w, mu, barrier, pressure)
+        stress = nominal_stress(f, j, inverse_t, w, mu, barrier, stiffening, pressure)
         for a in range(n):
             g = gradient[s, q, a]
             wp.atomic_add(force_out, begin + elements[s, a], stress * g)
@@ -134,6 +143,7 @@ def point_stress(
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
     barrier: wp.float64,
+    stiffening: wp.float64,
     nodes: int,
     items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
@@ -154,7 +164,7 @@ def point_stress(
     w = weight[s, q]
     inverse_t = wp.transpose(wp.inverse(f))
     jacobian_out[e, q] = j
-    stress_out[e, q] = nominal_stress(f, j, inverse_t, w, mu, barrier, pressure_in[e])
+    stress_out[e, q] = nominal_stress(f, j, inverse_t, w, mu, barrier, stiffening, pressure_in[e])
     cofactor_out[e, q] = (w * j) * inverse_t
 
 
@@ -200,6 +210,7 @@ def point_state(
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
     barrier: wp.float64,
+    stiffening: wp.float64,
     nodes: int,
     items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
@@ -207,13 +218,15 @@ def point_state(
     spatial_out: wp.array3d(dtype=wp.vec3d),
     left_out: wp.array3d(dtype=wp.vec3d),
     right_out: wp.array3d(dtype=wp.vec3d),
-    scale_out: wp.array2d(dtype=wp.vec2d),
+    scale_out: wp.array2d(dtype=wp.vec4d),
 ):
     """Vectors of which the tangent is made, for each element, quadrature point and node.
 
     With g = F^-T grad N and h = F grad N: spatial = g, left = -2/3 c h, right = left + (2/9 c I1 +
-    w p J + w mu barrier [b > 0]) g, scale = (c, c I1 / 3 - w p J - w mu barrier b sign(ln J)),
-    c = w mu J^(-2/3). A thread for each point.
+    w p J + w mu barrier [b > 0]) g, scale = (c, c I1 / 3 - w p J - w mu barrier b sign(ln J), s,
+    2/9 c I1), c = w mu J^(-2/3) (1 + stiffening m^2). By the growth of c the tangent has s d x d
+    more, with d = left + 2/9 c I1 g and s = 9 w mu stiffening m (J^(-2/3) / c)^2. A thread for
+    each point.
     """
     item, q = wp.tid()
     e = items[item]
@@ -223,11 +236,15 @@ def point_state(
     j = wp.determinant(f)
     w = weight[s, q]
     inverse_t = wp.transpose(wp.inverse(f))
-    c = w * mu * wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
-    ci1 = c * wp.ddot(f, f)
+    power = wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
+    i1 = wp.ddot(f, f)
+    m = power * i1 - wp.float64(3.0)
+    c = w * mu * power * (wp.float64(1.0) + stiffening * m * m)
+    ci1 = c * i1
     b = beyond(j)
     wpj = w * (pressure * j + mu * barrier * b)
-    along = ci1 * wp.float64(2.0) / wp.float64(9.0) + w * pressure * j
+    isochoric = ci1 * wp.float64(2.0) / wp.float64(9.0)
+    along = isochoric + w * pressure * j
     if b != wp.float64(0.0):
         along += w * mu * barrier
     for a in range(elements.shape[1]):
@@ -236,7 +253,8 @@ def point_state(
         spatial_out[e, q, a] = g
         left_out[e, q, a] = left
         right_out[e, q, a] = left + along * g
-    scale_out[e, q] = wp.vec2d(c, ci1 / wp.float64(3.0) - wpj)
+    growth = wp.float64(9.0) * w * mu * stiffening * m * (power / c) * (power / c)
+    scale_out[e, q] = wp.vec4d(c, ci1 / wp.float64(3.0) - wpj, growth, isochoric)
 
 
 @wp.func
@@ -250,12 +268,13 @@ def tangent_block(
     spatial_in: wp.array3d(dtype=wp.vec3d),
     left_in: wp.array3d(dtype=wp.vec3d),
     right_in: wp.array3d(dtype=wp.vec3d),
-    scale_in: wp.array2d(dtype=wp.vec2d),
+    scale_in: wp.array2d(dtype=wp.vec4d),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
 ) -> wp.mat33d:
     """Condensed tangent of nodes a and b of an element.
 
-    K_ab = sum_q c (dNa . dNb) I + ga x right_b + left_a x gb + scale gb x ga, plus kappa/v0 dv dv.
+    K_ab = sum_q c (dNa . dNb) I + ga x right_b + left_a x gb + scale gb x ga + s da x db, plus
+    kappa/v0 dv dv.
     """
     # Condensation of p = kappa (v - v0) / v0: one rank-1 term for the whole element.
     k = wp.outer(stiff * volume_gradient_in[e, a], volume_gradient_in[e, b])
@@ -268,6 +287,8 @@ def tangent_block(
         k += wp.outer(ga, right_in[e, q, b])
         k += wp.outer(left_in[e, q, a], gb)
         k += wp.outer(s[1] * gb, ga)
+        if s[2] != wp.float64(0.0):
+            k += wp.outer(s[2] * (left_in[e, q, a] + s[3] * ga), left_in[e, q, b] + s[3] * gb)
     return k + diagonal * wp.identity(n=3, dtype=wp.float64)
 
 
@@ -281,7 +302,7 @@ def element_tangent(
     spatial_in: wp.array3d(dtype=wp.vec3d),
     left_in: wp.array3d(dtype=wp.vec3d),
     right_in: wp.array3d(dtype=wp.vec3d),
-    scale_in: wp.array2d(dtype=wp.vec2d),
+    scale_in: wp.array2d(dtype=wp.vec4d),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
     block_out: wp.array(dtype=wp.mat33d),
 ):
@@ -310,7 +331,7 @@ def element_tangent_by_pair(
     spatial_in: wp.array3d(dtype=wp.vec3d),
     left_in: wp.array3d(dtype=wp.vec3d),
     right_in: wp.array3d(dtype=wp.vec3d),
-    scale_in: wp.array2d(dtype=wp.vec2d),
+    scale_in: wp.array2d(dtype=wp.vec4d),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
     block_out: wp.array(dtype=wp.mat33d),
 ):
@@ -381,6 +402,7 @@ def element_stress(
     weight: wp.array2d(dtype=wp.float64),
     mu: wp.float64,
     barrier: wp.float64,
+    stiffening: wp.float64,
     nodes: int,
     items: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3d),
@@ -400,7 +422,9 @@ def element_stress(
         third = wp.trace(b) / wp.float64(3.0)
         deviator = b - third * wp.identity(n=3, dtype=wp.float64)
         power = wp.pow(wp.abs(j), wp.float64(-2.0) / wp.float64(3.0))
-        total += (weight[s, q] * mu * power) * deviator
+        m = power * wp.trace(b) - wp.float64(3.0)
+        stiff = wp.float64(1.0) + stiffening * m * m
+        total += (weight[s, q] * mu * power * stiff) * deviator
         # J times the barrier's mean stress; the weights are of the undeformed volume.
         total += (weight[s, q] * mu * barrier * beyond(j)) * wp.identity(n=3, dtype=wp.float64)
         volume += weight[s, q] * j

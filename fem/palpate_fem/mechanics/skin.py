@@ -14,21 +14,25 @@ from palpate_fem.mechanics.reference_element import rest_gradients, volume_form
 from palpate_fem.mesh.solid import SolidMesh
 
 
-def energy_density(f: Floats, mu: float, barrier: float = VOLUME_BARRIER) -> Floats:
-    """W = mu/2 (J^(-2/3) tr(F^T F) - 3 + barrier max(0, |ln J| - 0.25)^2) [J/m^3], shape (...).
+def energy_density(
+    f: Floats, mu: float, barrier: float = VOLUME_BARRIER, stiffening: float = 0.0
+) -> Floats:
+    """W = mu/2 (m + stiffening/3 m^3 + barrier max(0, |ln J| - 0.25)^2) [J/m^3], shape (...).
 
-    Per unit of undeformed volume. For J = 1 this is the paper's equation "neo_hookean" up to a
-    constant; the volumetric part belongs to the element and its pressure.
+    Per unit of undeformed volume, with m = J^(-2/3) tr(F^T F) - 3. For J = 1 and no stiffening this
+    is the paper's equation "neo_hookean" up to a constant; the volumetric part belongs to the
+    element and its pressure.
 
     Args:
         f: Deformation gradients, shape (..., 3, 3).
         mu: Shear modulus [Pa].
         barrier: Stiffness against a change of volume at a single point, in shear moduli; 0 = none.
+        stiffening: See `FingertipParameters`.
     """
     j = np.linalg.det(f)
     isochoric = j ** (-2 / 3) * np.sum(f * f, axis=(-2, -1)) - 3
     beyond = np.maximum(0.0, np.abs(np.log(j)) - BARRIER_FROM)
-    return np.asarray(mu / 2 * (isochoric + barrier * beyond**2))
+    return np.asarray(mu / 2 * (isochoric + stiffening / 3 * isochoric**3 + barrier * beyond**2))
 
 
 class SkinElements:
@@ -42,12 +46,14 @@ class SkinElements:
         shear_modulus_pa: float,
         bulk_ratio: float,
         volume_barrier: float,
+        strain_stiffening: float,
     ) -> None:
         """Prepare the elements; see `EquilibriumSystem`.
 
         ``pairs`` are the blocks of the node pairs of each element in the tangent, (E, n, n).
         """
         self.mu, self.volume_barrier = shear_modulus_pa, volume_barrier
+        self.strain_stiffening = strain_stiffening
         self.gradient_values, self.weight_values = rest_gradients(mesh)
         self.rest_volume = self.weight_values.sum(axis=1)
         self.count, nodes = mesh.elements.shape
@@ -65,7 +71,7 @@ class SkinElements:
         self._frozen_gradient = vec3s(np.zeros((self.count, nodes, 3)))
         # Results of `point_state`, of which the tangent is made.
         self._parts = [vec3s(np.zeros((self.count, points, nodes, 3))) for _ in range(3)]
-        self._parts.append(wp.zeros((self.count, points), dtype=wp.vec2d, device=DEVICE))
+        self._parts.append(wp.zeros((self.count, points), dtype=wp.vec4d, device=DEVICE))
 
     def add_forces(
         self, items: wp.array, position: wp.array, pressure: wp.array, force: wp.array
@@ -149,9 +155,13 @@ class SkinElements:
         return float(self._jacobian.numpy().min())
 
     @property
+    def constants(self) -> list[wp.float64]:
+        """Those of the law, as kernels take them."""
+        return [*map(wp.float64, (self.mu, self.volume_barrier, self.strain_stiffening))]
+
+    @property
     def _model(self) -> list[object]:
-        constants = wp.float64(self.mu), wp.float64(self.volume_barrier)
-        return [self._elements, self._gradient, self._weight, *constants, self._nodes]
+        return [self._elements, self._gradient, self._weight, *self.constants, self._nodes]
 
     @property
     def _condensed(self) -> list[object]:

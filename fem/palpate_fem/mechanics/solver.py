@@ -95,6 +95,7 @@ class Fingertip:
             bulk_ratio=parameters.bulk_ratio,
             contact=settings.contact.scaled(parameters.shear_modulus_pa / REFERENCE_MODULUS_PA),
             volume_barrier=settings.volume_barrier,
+            strain_stiffening=parameters.strain_stiffening or 0.0,
         )
 
     @property

@@ -123,6 +123,7 @@ class EquilibriumSystem:
         bulk_ratio: float,
         contact: ContactSettings,
         volume_barrier: float = VOLUME_BARRIER,
+        strain_stiffening: float = 0.0,
         held: NDArray[np.bool_] | None = None,
     ) -> None:
         """Prepare the equations.
@@ -134,6 +135,7 @@ class EquilibriumSystem:
             bulk_ratio: Bulk over shear modulus.
             contact: Constants of the contact laws.
             volume_barrier: See `energy_density`.
+            strain_stiffening: See `FingertipParameters`.
             held: Prescribed components (V, 3); None = the mesh's fixed nodes. They keep the
                 positions that they have in the state.
         """
@@ -153,6 +155,7 @@ class EquilibriumSystem:
             shear_modulus_pa=shear_modulus_pa,
             bulk_ratio=bulk_ratio,
             volume_barrier=volume_barrier,
+            strain_stiffening=strain_stiffening,
         )
         half, nodes = self.skin.count // 2, len(mesh.nodes)
         self._halves = self.skin.items[:half], self.skin.items[half:]

@@ -22,6 +22,7 @@ class FingertipTable(StrictConfig):
     total_thickness_m: float | None = None
     fluid_volume_m3: float | None = None
     bulk_ratio: float | None = None
+    strain_stiffening: float | None = None
 
     def parameters(self) -> FingertipParameters:
         """As parameters of the solver.

@@ -101,6 +101,7 @@ class VerificationBody:
         core: DistanceGrid | None = None,
         mu: float = MU,
         bulk_ratio: float = BULK_RATIO,
+        stiffening: float = 0.0,
         contact: ContactSettings | None = None,
         settings: NewtonSettings = TIGHT,
     ) -> None:
@@ -111,7 +112,13 @@ class VerificationBody:
         self.mesh, self.mu, self.bulk = mesh, mu, bulk_ratio * mu
         self.contact = contact or ContactSettings()
         self.system = EquilibriumSystem(
-            mesh, core, shear_modulus_pa=mu, bulk_ratio=bulk_ratio, contact=self.contact, held=held
+            mesh,
+            core,
+            shear_modulus_pa=mu,
+            bulk_ratio=bulk_ratio,
+            contact=self.contact,
+            strain_stiffening=stiffening,
+            held=held,
         )
         self.settings = settings
         self.held = np.ones(mesh.nodes.shape, bool)

@@ -36,7 +36,7 @@ EDGE_M = 0.6e-3
 LAYERS = 2
 """Elements through the skin."""
 
-SKIN = ("skin_thickness_m", "shear_modulus_pa", "friction_coefficient")
+SKIN = ("skin_thickness_m", "shear_modulus_pa", "strain_stiffening", "friction_coefficient")
 """Settings of an experiment that say what its skin is."""
 
 _STRAIGHT_M = 1e-9
@@ -66,6 +66,7 @@ class ExperimentSpec:
         units_each: Specimens that execute each trajectory, drawn by its name; 0 = all.
         skin_thickness_m: Of the unpressurised skin [m]; None = the simulator's own, as below.
         shear_modulus_pa: Of the skin [Pa].
+        strain_stiffening: Of the skin, as `palpate_fem.config.FingertipParameters` has it.
         friction_coefficient: Between indenter and skin.
         registration_seed: Of the robots' registration; None = ``seed``. Experiments of the same
             specimens with the same one are by robots that stand equally wrong.
@@ -84,6 +85,7 @@ class ExperimentSpec:
     units_each: int = 0
     skin_thickness_m: float | None = None
     shear_modulus_pa: float | None = None
+    strain_stiffening: float | None = None
     friction_coefficient: float | None = None
     registration_seed: int | None = None
     layers: int = LAYERS
