@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
+import io
 import os
 import signal
 import subprocess
@@ -197,6 +199,40 @@ while True:
     sys.stdout.write(f"{i}\\n"); sys.stdout.flush()
     time.sleep(0.01)
 """
+
+
+class FillingDisk(io.BufferedWriter):
+    """A file whose disk is full for one write, of which half still fits."""
+
+    full = False
+
+    def write(self, data: Any) -> int:
+        if not type(self).full:
+            return super().write(data)
+        type(self).full = False
+        super().write(data[: len(data) // 2])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_record_with_half_a_write_in_it_never_looks_whole(
+    tmp_path: Path, payload: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where there is room again for the end: a chaos run found such a file."""
+    with monkeypatch.context() as patch:
+        opened = "palpate.files.record.open"
+        patch.setattr(opened, lambda path, _: FillingDisk(io.FileIO(path, "xb")), raising=False)
+        writer = RecordWriter(tmp_path / "run.mcap")
+    writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=1)
+    writer.flush()
+    writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=2)
+    FillingDisk.full = True
+    with pytest.raises(RecordingError, match="No space left"):
+        writer.flush()
+    with pytest.raises(RecordingError, match="No space left"):
+        writer.close()
+    writer.abandon()
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap.part"]
+    assert [item.log_time_ns for item in read_record(recover(writer.part))] == [1]
 
 
 def test_kill_9_loses_no_more_than_a_flush(tmp_path: Path, examples: dict[str, Any]) -> None:

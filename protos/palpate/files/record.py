@@ -114,6 +114,7 @@ class RecordWriter:
         self._schemas: dict[str, int] = {}
         self._last_flush = time.monotonic()
         self._closed = False
+        self._broken: RecordingError | None = None  # a write has failed, perhaps half-way
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file: IO[bytes] = open(self.part, "xb")
@@ -218,10 +219,14 @@ class RecordWriter:
         """Finish the file and give it its final name.
 
         Raises:
-            RecordingError: The disk is full or gone; the ``.part`` stays.
+            RecordingError: The disk is full or gone, or was at an earlier write, of which half may
+                stand in the file: there may be room for the end again, and the file would look
+                whole. The ``.part`` stays.
         """
         if self._closed:
             return
+        if self._broken is not None:
+            raise self._broken
         self._closed = True
         try:
             self._writer.finish()
@@ -241,10 +246,11 @@ class RecordWriter:
                 file.close()
 
     def _failed(self, error: OSError) -> RecordingError:
-        return RecordingError(
+        self._broken = RecordingError(
             f"cannot write {self.part}: {error.strerror or error}",
             remedy="free space on that disk or choose another folder; what was flushed is kept",
         )
+        return self._broken
 
     def __enter__(self) -> Self:
         return self
