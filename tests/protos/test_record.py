@@ -235,6 +235,17 @@ def test_a_record_with_half_a_write_in_it_never_looks_whole(
     assert [item.log_time_ns for item in read_record(recover(writer.part))] == [1]
 
 
+def test_nothing_is_left_of_a_record_that_could_not_begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = "palpate.files.record.open"
+    monkeypatch.setattr(opened, lambda path, _: FillingDisk(io.FileIO(path, "xb")), raising=False)
+    FillingDisk.full = True
+    with pytest.raises(RecordingError, match="No space left"):
+        RecordWriter(tmp_path / "run.mcap")
+    assert not any(tmp_path.iterdir())
+
+
 def test_kill_9_loses_no_more_than_a_flush(tmp_path: Path, examples: dict[str, Any]) -> None:
     """At 100 Hz 0.3 s are 30 messages; the count is compared, not a clock."""
     path = tmp_path / "run.mcap"

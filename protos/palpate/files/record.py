@@ -102,8 +102,8 @@ class RecordWriter:
         metadata: Facts about the run, e.g. station and command.
 
     Raises:
-        RecordingError: The file cannot be created or written (full disk, no permission); the
-            ``.part`` keeps what was written before.
+        RecordingError: The file cannot be created or written (full disk, no permission); nothing is
+            left of it.
     """
 
     def __init__(self, path: Path, metadata: Mapping[str, str] | None = None) -> None:
@@ -139,6 +139,10 @@ class RecordWriter:
             self._writer.add_metadata(METADATA, facts)
             self._writer.flush()
         except OSError as error:
+            with contextlib.suppress(OSError):  # its buffer may fail once more
+                self._file.close()
+            with contextlib.suppress(OSError):
+                self.part.unlink()  # nothing of the run is in it; a service tries every second
             raise self._failed(error) from error
 
     def write(
