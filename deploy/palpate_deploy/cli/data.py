@@ -159,8 +159,8 @@ def data_generate(
     strain_stiffening: Annotated[
         float | None,
         typer.Option(
-            help="Yeoh's 3 C3 / C1 of the skin, as silicone has it: 0.004 and more; with it the "
-            "deepest pinches do not snap [default: neo-Hooke]."
+            help="Yeoh's 3 C3 / C1 of the skin, as silicone has it: 0.004 and more; with it "
+            "most of the deepest pinches hold [default: neo-Hooke]."
         ),
     ] = None,
     fill_ml: Annotated[

@@ -139,8 +139,11 @@ class BatchedFactor:
         self._launch = Launches(device)
         self._processors = wp.get_device(device).sm_count if self.values.device.is_cuda else 0
         self.few = self._processors // 4 if few is None else few
-        self._by_columns = [
-            tiles.own_tiles[tiles.level == level].max() >= columns for level in range(tiles.levels)
+        self._columns = columns
+        # Of each level: the widest front, and the most rows, in tiles.
+        self._largest = [
+            tiles.fronts[tiles.level == level, :2].max(axis=0).tolist()
+            for level in range(tiles.levels)
         ]
         self.bad = wp.zeros(slots, dtype=wp.int32, device=device)
         self.marked = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
@@ -185,7 +188,8 @@ class BatchedFactor:
             begin = [slots, self.marked, self._by_level, *plan, self._sources_at, self._sources,
                      first]  # fmt: skip
             known = [*sizes, self.values, self._shares]
-            if self._by_columns[level] and (last - first) * count <= self.few:
+            wide = self._largest[level][0] >= self._columns
+            if wide and (last - first) * count <= self.few:
                 self._factorise_by_columns(level, slots, begin, known)
             else:
                 self._launch(
@@ -208,8 +212,7 @@ class BatchedFactor:
     ) -> None:
         """Factorise panels column by column, each by as many blocks of threads as it can use."""
         first, last = self._front_begins[level : level + 2]
-        of_level = self.tiles.fronts[self.tiles.level == level]
-        width, height = int(of_level[:, 0].max()), int(of_level[:, 1].max())
+        width, height = self._largest[level]
         shape = (last - first, len(slots))
         fronts = [slots, self.marked, self._by_level, self._fronts, first]
         self._launch(

@@ -114,7 +114,7 @@ class RecordWriter:
         self._schemas: dict[str, int] = {}
         self._last_flush = time.monotonic()
         self._closed = False
-        self._broken: RecordingError | None = None  # a write has failed, perhaps half-way
+        self._broken: RecordingError | None = None  # why a write failed, perhaps half-way
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file: IO[bytes] = open(self.part, "xb")
@@ -223,9 +223,8 @@ class RecordWriter:
         """Finish the file and give it its final name.
 
         Raises:
-            RecordingError: The disk is full or gone, or was at an earlier write, of which half may
-                stand in the file: there may be room for the end again, and the file would look
-                whole. The ``.part`` stays.
+            RecordingError: The disk is full or gone, or an earlier write has failed: half of that
+                write may stand in the file, which must not look whole. The ``.part`` stays.
         """
         if self._closed:
             return

@@ -93,8 +93,8 @@ def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> l
         if stop is not None and stop.is_set():
             break
         try:
-            # A recovery that was itself killed, its source is still there; or a disk that refused
-            # the first write: each new attempt leaves such a part.
+            # A recovery that was itself killed, its source is still there; or a recorder that was
+            # killed before its first write was whole.
             if part.name.endswith(f"{RECOVERED}{PART}") or part.stat().st_size < _HEAD_BYTES:
                 part.unlink()
             else:
