@@ -227,8 +227,8 @@ def stiffening() -> str:
 Why skin snaps below small indenters: [ADR 23](../adr/0023-mortar-contact.md#why-it-snaps). The same
 campaign with `palpate data generate FOLDER --strain-stiffening 0.004`, as constants published for
 a soft silicone have it: **{len(good)} of {len(whole)} ({len(good) / len(whole):.1%}) reach the full
-depth or 32 N** (the goal is 98 %). Angled presses end with forces that are {np.median(stiffer):.2%} larger in the
-median, {max(stiffer):.1%} at most.
+depth or 32 N** (the goal is 98 %). Angled presses end with forces that are
+{np.median(stiffer):.2%} larger in the median, {max(stiffer):.1%} at most.
 
 `{curves["command"]}`, the same with `{curves["other"]}`, and both with other skins:
 
