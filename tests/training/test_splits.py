@@ -152,6 +152,8 @@ def test_groups_are_dealt_in_shares() -> None:
     few = by_group(group[:35], test_share=0.01, validation_share=0.01)
     counts = {side: len(found) for side, found in by_block(few, group).items()}
     assert counts == {"train": 3, "validation": 1, "test": 1, "guard": 0}
+    split = by_group(np.arange(20_000, dtype=np.int32))
+    assert (len(split.train), len(split.validation), len(split.test)) == (18_000, 1000, 1000)
 
 
 def test_what_cannot_be_split_is_named() -> None:

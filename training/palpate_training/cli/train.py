@@ -43,6 +43,10 @@ GainSpread = Annotated[
     ),
 ]
 
+Width = Annotated[int, typer.Option(min=1, help="Of the residual layers.")]
+
+BlockCount = Annotated[int, typer.Option(min=1, help="Residual blocks of two layers.")]
+
 Device = Annotated[
     str, typer.Option(help="Where it is trained: cpu, cuda, or auto = on a GPU if there is one.")
 ]
@@ -52,6 +56,7 @@ BatchRows = Annotated[
 
 EPOCHS = 80
 BATCH_ROWS = 256
+WIDTH, BLOCKS = 256, 3
 GAIN_SPREAD = 0.1
 """The defaults of ``MembersConfig``, whose module needs torch."""
 
@@ -318,6 +323,8 @@ def train_features_command(
     serials: Serials = None,
     device: Device = "auto",
     batch_rows: BatchRows = BATCH_ROWS,
+    width: Width = WIDTH,
+    blocks: BlockCount = BLOCKS,
 ) -> None:
     """Train force and contact location, test on unseen presses, write the bundle.
 
@@ -340,7 +347,12 @@ def train_features_command(
             name=name,
             version=version,
             config=replace(
-                FEATURES_CONFIG, epochs=epochs, gain_spread=gain_spread, batch_rows=batch_rows
+                FEATURES_CONFIG,
+                epochs=epochs,
+                gain_spread=gain_spread,
+                batch_rows=batch_rows,
+                width=width,
+                blocks=blocks,
             ),
             seed=seed,
             serials=serials or (),
@@ -362,8 +374,8 @@ def train_population_command(
     seed: Seed = 0,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the rows at most.")] = 60,
     batch_rows: Annotated[int, typer.Option(min=1, help="Rows in one step.")] = 4096,
-    width: Annotated[int, typer.Option(min=1, help="Of its layers.")] = 256,
-    blocks: Annotated[int, typer.Option(min=1, help="Residual blocks of two layers.")] = 3,
+    width: Width = WIDTH,
+    blocks: BlockCount = BLOCKS,
     common: Annotated[
         float,
         typer.Option(min=0.0, max=1.0, help="Share of the electrodes' common mode that it reads."),

@@ -126,10 +126,17 @@ def unseen_sensor(
     return _guarded(validation, test, sensor, guard_rows)
 
 
+HELD_OUT_MOST = 1000
+"""Groups that are enough to measure an error by: its 95 % interval is a few per cent wide."""
+
+
 def by_group(
     group: Labels, *, test_share: float = 0.2, validation_share: float = 0.1, seed: int = 0
 ) -> RowSplit:
-    """Deal whole groups (presses, trajectories) to test, validation and train."""
+    """Deal whole groups (presses, trajectories) to test, validation and train.
+
+    Test and validation get their shares, but ``HELD_OUT_MOST`` groups each at most.
+    """
     groups = np.unique(group)
     if len(groups) < 3:
         raise DatasetError(
@@ -137,8 +144,10 @@ def by_group(
             remedy="record more presses: at least three, better a hundred",
         )
     dealt = np.random.default_rng(seed).permutation(groups)
-    tests = max(1, round(test_share * len(groups)))
-    validations = max(1, round(validation_share * len(groups)))
+    tests, validations = (
+        min(HELD_OUT_MOST, max(1, round(share * len(groups))))
+        for share in (test_share, validation_share)
+    )
     test = np.isin(group, dealt[:tests])
     validation = np.isin(group, dealt[tests : tests + validations])
     # No guard: a group starts and ends without contact, so neighbours across it share nothing.
