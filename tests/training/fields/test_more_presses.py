@@ -14,7 +14,7 @@ from palpate_training.cli import data_app, train_app
 from palpate_training.datasets.experiment import MixedDataset, read_mixed, write_mixed
 from palpate_training.tasks.evaluate import evaluate
 
-pytest.importorskip("onnx")
+onnx = pytest.importorskip("onnx")
 
 
 def run(app: typer.Typer, *words: str | Path) -> str:
@@ -37,7 +37,11 @@ def test_two_experiments_make_bundles_that_are_tested_on_a_third(
     run(data_app, "features", first, more, rows)
     features = tmp_path / "features"
     out = ["--data", str(rows), "--out", str(features), "--name", "features-twin"]
-    run(train_app, "features", *out, *serial, *quick)
+    size = ["--width", "32", "--blocks", "1"]
+    run(train_app, "features", *out, *serial, *quick, "--gain-spread", "0", *size)
+    layers = {tuple(one.dims) for one in onnx.load(features / "model.onnx").graph.initializer}
+    assert (32, 32) in layers
+    assert (256, 256) not in layers
     bounded = tmp_path / "features-twin" / "9"
     run(train_app, "intervals", features, bounded, "--held-out", held)
     assert read_bundle(bounded).manifest.version == 9
