@@ -201,8 +201,8 @@ class ChaosStation:
         if self._emulator is not None:
             for process in self.find("emulate biotac-bridge"):
                 send(process.pid, 9)
-            self._emulator.kill()
-            self._emulator.wait()
+            # It ends with its child. Killed before, it leaves a zombie that nobody waits for.
+            self._emulator.wait(10.0)
             self._emulator = None
             self.run("rm", "-f", LINE)
 
