@@ -60,8 +60,8 @@ Mended:
   and without a tare there is no estimate. It goes on with its last tare now
   ([tare and health](../tare-and-health.md)).
 * Zombies called `palpate`, one for each time that the sensor was unplugged, were not the station's:
-  the program that breaks things ended `nsenter` before `nsenter` had waited for the emulated finger.
-  The run above still has them; `--only unplugged` unplugs it 13 times and leaves none.
+  the program that breaks things ended `nsenter` before that had waited for the emulated finger. It
+  waits now: unplugged 13 times in a row, it leaves none. Runs at commits before 6a113a6 have them.
 
 Not mended:
 
