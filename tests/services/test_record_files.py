@@ -15,7 +15,7 @@ import pytest
 from palpate.bus import TapSample
 from palpate.bus.topics import ELECTRODES, TARE, sensor_key
 from palpate.codec import ELECTRODE_FRAME
-from palpate.errors import ErrorCode
+from palpate.errors import ErrorCode, RecordingError
 from palpate.files import record as record_module
 from palpate.files.record import RecordWriter, check_readable, read_record, summarise
 from palpate.health import Health
@@ -187,6 +187,27 @@ def test_too_little_space_is_reported_and_recording_resumes(
     records = sorted((tmp_path / "runs").iterdir())
     assert [[item.sequence for item in read_record(r)] for r in records] == [[1], [3]]
     assert all(record.suffix == ".mcap" for record in records)
+
+
+def test_each_full_disk_is_told_once_whatever_else_is_wrong(
+    open_files: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Messages are lost in the queue, too; and health stays DEGRADED for a while after it."""
+    free = [10**9]
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
+    monkeypatch.setattr(writer_module, "RETRY_S", 0.0)
+    monkeypatch.setattr(writer_module, "free_bytes", lambda _: free[0])
+    with open_files(min_free_bytes=10**8) as (files, health):
+        health.fail(RecordingError("messages come too fast", remedy="record fewer"))
+        for full in range(1, 3):
+            free[0] = 10**7
+            for _ in range(5):
+                files.tick()
+            assert health.counters["disk_failures"] == full
+            free[0] = 10**9
+            files.tick()
+    told = [record for record in caplog.records if "bytes are free" in record.getMessage()]
+    assert len(told) == 2
 
 
 def test_write_error_of_the_disk_is_survived(

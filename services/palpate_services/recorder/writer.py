@@ -211,6 +211,7 @@ class RecordFiles:
         self._opened_s = 0.0
         self._checked_s = 0.0
         self._tried_s = float("-inf")
+        self._told = False  # of the present trouble with the disk
         self._recovery = RecordRecovery(config.out, health)
         MeshLibrary(config.bundles)  # raises for one that is missing, which a view would only log
         self._retention = retention.Retention(config, station, health)
@@ -371,6 +372,7 @@ class RecordFiles:
             self._fail(error.problem)
             return
         self._size = self._unflushed = 0
+        self._told = False
         self._tares.clear()
         self._opened_s = time.monotonic()
         if self._config.rrd:
@@ -458,9 +460,10 @@ class RecordFiles:
 
     def _fail(self, why: str) -> None:
         error = disk_error(self._config.out, why)
-        if self._health.state is not ServiceState.DEGRADED:
+        if not self._told:  # health may be DEGRADED for another reason, or still from the last time
             _log.error("%s", error)
             self._counts["disk_failures"] += 1
+        self._told = True
         self._health.fail(error)
         self.report()
 
