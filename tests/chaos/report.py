@@ -266,9 +266,9 @@ def _seen(kind: Fault, event: dict[str, Any], notes: Notes) -> float | None:
             first = _first(one["at_ns"] for one in said
                            if one["service"] == name and one["state"] == "DEGRADED")  # fmt: skip
         elif what == "lost":
-            first = _first(one["at_ns"] for one in said
+            first = _first(one["at_ns"] for one in notes.robot["statuses"]
                            if one["service"] == "gateway" and "LOST" in one["sensors"].values()
-                           )  # fmt: skip
+                           and event["tried_ns"] <= one["at_ns"] <= end)  # fmt: skip
             frames = notes.frames[notes.frames[:, _ARRIVAL] < (first or end)]
             if first is not None and len(frames):
                 return (first - int(frames[-1, _STAMP])) * 1e-9

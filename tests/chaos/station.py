@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import signal
 import struct
 import subprocess
 from dataclasses import dataclass
@@ -201,7 +202,9 @@ class ChaosStation:
         if self._emulator is not None:
             for process in self.find("emulate biotac-bridge"):
                 send(process.pid, 9)
-            # It ends with its child. Killed before, it leaves a zombie that nobody waits for.
+            # nsenter ends with its child; killed before, it leaves a zombie that nobody waits for.
+            # While a child was stopped it has stopped, too.
+            self._emulator.send_signal(signal.SIGCONT)
             self._emulator.wait(10.0)
             self._emulator = None
             self.run("rm", "-f", LINE)
