@@ -64,8 +64,8 @@ Mended:
   waits now: unplugged 13 times in a row, it leaves none. Runs at commits before 6a113a6 have them.
 * Of four full disks one was not in the log: the recorder wrote it down only if its health was not
   DEGRADED already, for another reason or still from the last time. Five of five are there since.
-* A finger that is unplugged is shown as lost after 0.02 s. Runs at commits before this line saw the
-  second status only, after 0.22 s: they looked from when the program had done with unplugging it.
+* A finger that is unplugged is shown as lost after 0.02 s. Runs at commits before c2646cc report
+  0.22 s: the program looked only after it had finished unplugging, and saw the second status.
 
 Not mended:
 

@@ -261,19 +261,21 @@ def _seen(kind: Fault, event: dict[str, Any], notes: Notes) -> float | None:
             late = np.flatnonzero(arrivals > too_old)
             first = int(too_old[late[0]]) if len(late) else None
     else:
-        said = [one for one in notes.robot["statuses"] if begun <= one["at_ns"] <= end]
+        # What is told of it may come before whoever does it has done.
+        tried = event["tried_ns"]
+        said = [one for one in notes.robot["statuses"] if tried <= one["at_ns"] <= end]
         if what == "state":
             first = _first(one["at_ns"] for one in said
                            if one["service"] == name and one["state"] == "DEGRADED")  # fmt: skip
         elif what == "lost":
-            first = _first(one["at_ns"] for one in notes.robot["statuses"]
+            first = _first(one["at_ns"] for one in said
                            if one["service"] == "gateway" and "LOST" in one["sensors"].values()
-                           and event["tried_ns"] <= one["at_ns"] <= end)  # fmt: skip
+                           )  # fmt: skip
             frames = notes.frames[notes.frames[:, _ARRIVAL] < (first or end)]
             if first is not None and len(frames):
                 return (first - int(frames[-1, _STAMP])) * 1e-9
         else:
-            first = _counted(kind.seen, said, notes, begun)
+            first = _counted(kind.seen, said, notes, tried)
     return None if first is None else max(0.0, (first - begun) * 1e-9)
 
 

@@ -51,19 +51,19 @@ class Event:
 
     Attributes:
         fault: Its name.
+        tried_ns: Just before it was done, which may take longer than its first effect.
         begun_ns: When it was done.
         mended_ns: When it was mended; without that ``begun_ns``.
         well_ns: When all was well again; 0 = not in time.
         pair: Whether another one came during it, or it came during another one.
-        tried_ns: Just before it was done, which may take longer than its first effect.
     """
 
     fault: str
+    tried_ns: int
     begun_ns: int
     mended_ns: int
     well_ns: int = 0
     pair: bool = False
-    tried_ns: int = 0
 
 
 @dataclass(slots=True)
@@ -226,7 +226,7 @@ def _begin(station: ChaosStation, fault: Fault) -> tuple[Event, Undo | None]:
             time.sleep(_LOOK_S)
             continue
         begun_ns = before_ns if undo is None else time.monotonic_ns()
-        return Event(fault.name, begun_ns, begun_ns, tried_ns=before_ns), undo
+        return Event(fault.name, before_ns, begun_ns, begun_ns), undo
 
 
 def _until_gone(broken: list[int]) -> None:

@@ -463,7 +463,7 @@ class RecordFiles:
         if not self._told:  # health may be DEGRADED for another reason, or still from the last time
             _log.error("%s", error)
             self._counts["disk_failures"] += 1
-        self._told = True
+            self._told = True
         self._health.fail(error)
         self.report()
 

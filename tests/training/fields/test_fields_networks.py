@@ -15,7 +15,7 @@ import torch
 from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import read_bundle
-from palpate_training.cli.train import EPOCHS, GAIN_SPREAD
+from palpate_training.cli.train import BLOCKS, EPOCHS, GAIN_SPREAD, WIDTH
 from palpate_training.datasets.experiment import MixedDataset
 from palpate_training.learning import export
 from palpate_training.learning.export import onnx_bytes, run_onnx
@@ -323,11 +323,12 @@ def test_unknown_untouched_counts_are_assumed(
     assert np.isfinite(fitted.counts(features)).all()
 
 
-def test_the_command_has_the_epochs_of_the_configuration() -> None:
+def test_the_command_has_the_defaults_of_the_configuration() -> None:
     assert FieldFitConfig().epochs == EPOCHS
     assert FEATURES_CONFIG.epochs == EPOCHS
     assert FieldFitConfig().gain_spread == GAIN_SPREAD
     assert FEATURES_CONFIG.gain_spread == GAIN_SPREAD
+    assert (FEATURES_CONFIG.width, FEATURES_CONFIG.blocks) == (WIDTH, BLOCKS)
 
 
 def test_synthesis_in_a_batch_has_the_bits_of_single_rows(

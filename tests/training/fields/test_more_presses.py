@@ -37,8 +37,8 @@ def test_two_experiments_make_bundles_that_are_tested_on_a_third(
     run(data_app, "features", first, more, rows)
     features = tmp_path / "features"
     out = ["--data", str(rows), "--out", str(features), "--name", "features-twin"]
-    size = ["--width", "32", "--blocks", "1"]
-    run(train_app, "features", *out, *serial, *quick, "--gain-spread", "0", *size)
+    narrow = ["--width", "32", "--blocks", "1"]
+    run(train_app, "features", *out, *serial, *quick, "--gain-spread", "0", *narrow)
     layers = {tuple(one.dims) for one in onnx.load(features / "model.onnx").graph.initializer}
     assert (32, 32) in layers
     assert (256, 256) not in layers
