@@ -155,6 +155,19 @@ def test_a_press_is_not_measured_with_its_own_rows(press_data: MakeData) -> None
     assert np.mean(flagged) <= 0.011
 
 
+def test_an_electrode_that_never_changed_is_no_rule_made_of_rounding(press_data: MakeData) -> None:
+    data = press_data(presses=80, rows=30)
+    rows = data.tared_counts.copy()
+    rows[:, 6] = 37.3
+    bare = replace(known_inputs(rows, data.group), pattern=None)
+    known, strange = with_pattern(bare, rows, data.group)
+    assert known.pattern is not None
+    assert np.mean(strange > 1.0) < 0.02
+    moved = rows.copy()
+    moved[:, 6] = 200.0
+    assert np.mean(strangeness(known.pattern, moved) > 1.0) > 0.95
+
+
 def test_few_presses_know_no_pattern(press_data: MakeData) -> None:
     known = _rows(press_data(presses=20))
     assert known.pattern is None

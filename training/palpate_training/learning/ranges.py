@@ -46,6 +46,11 @@ PRESSES_OF_PATTERN = 50
 
 _PATTERN_FOLDS = 9
 
+_CONSTANT = 1e-6
+"""Spread of a term, which has no unit, that is rounding: a value that never changes."""
+
+_ROWS_AT_ONCE = 1 << 16
+
 
 def ends_of(name: str, unit: str, rows: npt.NDArray[np.floating]) -> ValueRange:
     """Smallest and largest of every value of rows ``(N, I)``, and of vectors the longest."""
@@ -106,13 +111,17 @@ def with_pattern(
         What is known then, and how strange each row is without its press, over the limit.
     """
     whole = np.sinh(known.prototypes.astype(np.float64)) * known.scale
-    strange = np.zeros(len(rows))
+    origin = pattern_terms(np.arcsinh(whole / scale)).mean(axis=0)
     names = np.random.default_rng(0).permutation(np.unique(groups))
-    for part in np.array_split(names, min(_PATTERN_FOLDS, len(names))):
-        out = np.isin(groups, part)
-        without = _pattern(np.vstack([whole, rows[~out]]), scale, shrink)
-        strange[out] = strangeness(without, rows[out])
-    pattern = _pattern(np.vstack([whole, rows]), scale, shrink)
+    held = [
+        np.isin(groups, part) for part in np.array_split(names, min(_PATTERN_FOLDS, len(names)))
+    ]
+    parts = [_products(rows[out], scale, origin) for out in held]
+    every = _products(whole, scale, origin) + sum(parts)
+    strange = np.zeros(len(rows))
+    for out, part in zip(held, parts, strict=True):
+        strange[out] = strangeness(_pattern(every - part, scale, origin, shrink), rows[out])
+    pattern = _pattern(every, scale, origin, shrink)
     most = _share_below(strange, groups, 1.0 - unlike)
     return replace(known, pattern=replace(pattern, most=_shorter(most))), strange / most
 
@@ -141,15 +150,39 @@ def places_of(
     return distance / known.distance_max, compressed.mean(axis=1)
 
 
-def _pattern(rows: npt.NDArray[np.floating], scale: float, shrink: float) -> InputPattern:
-    """The pattern of rows, with a limit of one."""
-    terms = pattern_terms(np.arcsinh(rows.astype(np.float64) / scale))
-    centre, spread = terms.mean(axis=0), terms.std(axis=0)
-    spread = np.where(spread > 0.0, spread, 1.0)
-    scaled = (terms - centre) / spread
-    variance, directions = np.linalg.eigh(scaled.T @ scaled / len(scaled))
+def _products(
+    rows: npt.NDArray[np.floating], scale: float, origin: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Sums over rows of the products of ``(1, terms - origin)``, shape ``(1 + T, 1 + T)``.
+
+    Those of several parts add up, and what a part adds can be taken away, so each row's terms are
+    made once, whichever presses are held out.
+    """
+    found = np.zeros((1 + len(origin), 1 + len(origin)))
+    for first in range(0, len(rows), _ROWS_AT_ONCE):
+        some = rows[first : first + _ROWS_AT_ONCE].astype(np.float64)
+        terms = pattern_terms(np.arcsinh(some / scale)) - origin
+        terms = np.hstack([np.ones((len(terms), 1)), terms])
+        found += terms.T @ terms
+    return found
+
+
+def _pattern(
+    products: npt.NDArray[np.float64],
+    scale: float,
+    origin: npt.NDArray[np.float64],
+    shrink: float,
+) -> InputPattern:
+    """The pattern of the rows that ``_products`` are of, with a limit of one."""
+    moments = products / products[0, 0]
+    centre = moments[0, 1:]
+    covariance = moments[1:, 1:] - np.outer(centre, centre)
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    spread = np.where(spread > _CONSTANT, spread, 1.0)
+    variance, directions = np.linalg.eigh(covariance / np.outer(spread, spread))
     weights = directions / np.sqrt(np.maximum(variance, 0.0) + shrink) / spread[:, None]
-    return InputPattern(scale, centre.astype(np.float32), weights.astype(np.float32), 1.0)
+    centre = (origin + centre).astype(np.float32)
+    return InputPattern(scale, centre, weights.astype(np.float32), 1.0)
 
 
 def _share_below(
