@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from palpate.errors import DatasetError
 from palpate_training.cli import data_app
+from palpate_training.datasets.basis import fit_basis, subset
 from palpate_training.datasets.experiment import MixedDataset, read_mixed, write_mixed
 from palpate_training.datasets.features import FeatureDataset, joined
 from palpate_training.datasets.join import join_mixed
@@ -54,6 +55,19 @@ def test_fields_and_rows_are_those_of_the_parts(large: MixedDataset) -> None:
     few = join_mixed(parts, ["a", "b"], modes=2, force_modes=1)
     assert len(few.basis.modes) == 2
     assert few.basis.loss_mean > both.basis.loss_mean
+
+
+def test_common_modes_are_those_of_the_whole_fields(large: MixedDataset) -> None:
+    parts = [large, subset(other_skin(large), range(3))]
+    few = join_mixed(parts, ["a", "b"], modes=4, force_modes=3)
+    fields = [part.displacement(slice(None)) for part in parts]
+    whole = fit_basis(lambda: fields, count=4)
+    np.testing.assert_allclose(few.basis.mean, whole.mean, atol=1e-6 * np.abs(whole.mean).max())
+    ours, theirs = (one.modes.reshape(4, -1) for one in (few.basis, whole))
+    np.testing.assert_allclose(np.abs(ours @ theirs.T), np.eye(4), atol=1e-3)
+    assert few.basis.loss_mean == pytest.approx(whole.loss_mean, rel=1e-3)
+    assert few.basis.loss_max == pytest.approx(whole.loss_max, rel=1e-2)
+    assert few.basis.step == whole.step > 0.0
 
 
 def test_parts_that_do_not_fit_together_are_refused(large: MixedDataset, tmp_path: Path) -> None:

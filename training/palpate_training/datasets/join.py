@@ -6,6 +6,8 @@ which is a displacement of each node, means the same on all.
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.basis import Blocks, FieldEncoder, fit_basis
+from palpate_training.datasets.basis import (
+    FieldLoss,
+    lost,
+    mean_and_largest,
+    rounded,
+    with_step,
+)
 from palpate_training.datasets.container import Provenance, joined_provenance
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
@@ -168,16 +176,48 @@ def join_experiments(
 
 
 def _recoded(parts: Fields, count: int) -> tuple[FieldBasis, FloatArray]:
-    """Common modes of fields, and the coefficients of all rows."""
-    basis = fit_basis(_blocks(parts), count=count)
-    encode = FieldEncoder(basis)
-    return basis, np.concatenate([encode(block) for block in _blocks(parts)()])
+    """Common modes of fields, and the coefficients of all rows.
 
+    Every field lies in the span of the parts' modes and means. So modes are sought there, and whole
+    fields are made only to measure what is lost.
+    """
+    rows = sum(len(numbers) for _, numbers in parts)
+    shape = parts[0][0].mean.shape
+    flat = [basis.modes.reshape(len(basis.modes), -1).astype(np.float64) for basis, _ in parts]
+    means = [basis.mean.reshape(-1).astype(np.float64) for basis, _ in parts]
+    mean = np.zeros(math.prod(shape))
+    for modes, own, (_, numbers) in zip(flat, means, parts, strict=True):
+        mean += (len(numbers) * own + numbers.sum(axis=0, dtype=np.float64) @ modes) / rows
+    # A row is its part's coefficients, and 1 for how its part's mean differs from that of all.
+    ends = np.cumsum([0] + [len(modes) + 1 for modes in flat])
+    span, within = np.linalg.qr(
+        np.vstack([[*modes, own - mean] for modes, own in zip(flat, means, strict=True)]).T
+    )
+    turns = [within[:, first:end].T for first, end in itertools.pairwise(ends)]
+    scatter = np.zeros((span.shape[1], span.shape[1]))
+    for turn, (_, numbers) in zip(turns, parts, strict=True):
+        own = numbers.astype(np.float64) @ turn[:-1] + turn[-1]
+        scatter += own.T @ own
+    _, directions = np.linalg.eigh(scatter)
+    directions = directions[:, ::-1][:, : min(count, rows)]
+    exact = [
+        numbers @ (turn[:-1] @ directions) + turn[-1] @ directions
+        for turn, (_, numbers) in zip(turns, parts, strict=True)
+    ]
 
-def _blocks(parts: Fields) -> Blocks:
-    def blocks() -> Iterator[FloatArray]:
-        for basis, coefficients in parts:
-            for first in range(0, len(coefficients), _ROWS):
-                yield basis.decode(coefficients[first : first + _ROWS])
+    def losses(kept: FieldBasis) -> Iterator[FieldLoss]:
+        for numbers, (basis, given) in zip(exact, parts, strict=True):
+            for first in range(0, len(given), _ROWS):
+                block = slice(first, first + _ROWS)
+                yield lost(
+                    basis.decode(given[block]) - kept.decode(rounded(numbers[block], kept.step))
+                )
 
-    return blocks
+    def measure(kept: FieldBasis) -> FieldBasis:
+        loss_mean, loss_max = mean_and_largest(losses(kept))
+        return replace(kept, loss_mean=loss_mean, loss_max=loss_max)
+
+    modes = (span @ directions).T.reshape(-1, *shape).astype(np.float32)
+    first = FieldBasis(mean.reshape(shape).astype(np.float32), modes, 0.0, 0.0)
+    common = with_step(measure(first), measure)
+    return common, np.concatenate([rounded(numbers, common.step) for numbers in exact])
