@@ -339,10 +339,13 @@ def _modes(blocks: Blocks, mean: Floats, width: int, seed: int) -> Floats:
         seen = centred @ directions
         inner += seen.T @ seen
     _, turn = np.linalg.eigh(inner)
-    modes = np.ascontiguousarray((directions @ turn[:, ::-1]).T)
-    # A mode is known up to its sign; this one makes two runs, and two machines, agree.
+    return with_signs((directions @ turn[:, ::-1]).T)
+
+
+def with_signs(modes: Floats) -> Floats:
+    """Modes (K, 3 V), which are known up to their signs, with those on which two machines agree."""
     peak = np.abs(modes).argmax(axis=1)
-    return np.asarray(modes * np.sign(modes[np.arange(width), peak])[:, None])
+    return np.asarray(modes * np.sign(modes[np.arange(len(modes)), peak])[:, None])
 
 
 def _centred(blocks: Blocks, mean: Floats) -> Iterable[Floats]:

@@ -21,6 +21,7 @@ from palpate_training.datasets.basis import (
     lost,
     mean_and_largest,
     rounded,
+    with_signs,
     with_step,
 )
 from palpate_training.datasets.container import Provenance, joined_provenance
@@ -186,12 +187,12 @@ def _recoded(parts: Fields, count: int) -> tuple[FieldBasis, FloatArray]:
     flat = [basis.modes.reshape(len(basis.modes), -1).astype(np.float64) for basis, _ in parts]
     means = [basis.mean.reshape(-1).astype(np.float64) for basis, _ in parts]
     mean = np.zeros(math.prod(shape))
-    for modes, own, (_, numbers) in zip(flat, means, parts, strict=True):
-        mean += (len(numbers) * own + numbers.sum(axis=0, dtype=np.float64) @ modes) / rows
+    for part, own, (_, numbers) in zip(flat, means, parts, strict=True):
+        mean += (len(numbers) * own + numbers.sum(axis=0, dtype=np.float64) @ part) / rows
     # A row is its part's coefficients, and 1 for how its part's mean differs from that of all.
-    ends = np.cumsum([0] + [len(modes) + 1 for modes in flat])
+    ends = np.cumsum([0] + [len(part) + 1 for part in flat])
     span, within = np.linalg.qr(
-        np.vstack([[*modes, own - mean] for modes, own in zip(flat, means, strict=True)]).T
+        np.vstack([[*part, own - mean] for part, own in zip(flat, means, strict=True)]).T
     )
     turns = [within[:, first:end].T for first, end in itertools.pairwise(ends)]
     scatter = np.zeros((span.shape[1], span.shape[1]))
@@ -199,7 +200,8 @@ def _recoded(parts: Fields, count: int) -> tuple[FieldBasis, FloatArray]:
         own = numbers.astype(np.float64) @ turn[:-1] + turn[-1]
         scatter += own.T @ own
     _, directions = np.linalg.eigh(scatter)
-    directions = directions[:, ::-1][:, : min(count, rows)]
+    modes = with_signs((span @ directions[:, ::-1][:, : min(count, rows)]).T)
+    directions = span.T @ modes.T
     exact = [
         numbers @ (turn[:-1] @ directions) + turn[-1] @ directions
         for turn, (_, numbers) in zip(turns, parts, strict=True)
@@ -217,7 +219,11 @@ def _recoded(parts: Fields, count: int) -> tuple[FieldBasis, FloatArray]:
         loss_mean, loss_max = mean_and_largest(losses(kept))
         return replace(kept, loss_mean=loss_mean, loss_max=loss_max)
 
-    modes = (span @ directions).T.reshape(-1, *shape).astype(np.float32)
-    first = FieldBasis(mean.reshape(shape).astype(np.float32), modes, 0.0, 0.0)
-    common = with_step(measure(first), measure)
+    exact_basis = FieldBasis(
+        mean.reshape(shape).astype(np.float32),
+        modes.reshape(-1, *shape).astype(np.float32),
+        0.0,
+        0.0,
+    )
+    common = with_step(measure(exact_basis), measure)
     return common, np.concatenate([rounded(numbers, common.step) for numbers in exact])
