@@ -279,7 +279,7 @@ def _demo() -> Iterator[Claim]:
         "estimates": f"{touches['estimates']:,}",
         "touched": f"{touched['frames']:,}",
         "force": f"{touched['force_median_n']:.2f}",
-        "place": f"{1e3 * touched['location_median_m']:.1f}",
+        "place": f"{1e3 * touched['location_median_m']:.2f}",
         "light": f"{bins['0.5 to 1 N']['force_median_n']:.2f}",
         "hard": f"{bins['>= 8 N']['force_median_n']:.1f}",
         "all": f"{bins['all frames']['force_median_n']:.2f}",

@@ -219,11 +219,7 @@ def _recoded(parts: Fields, count: int) -> tuple[FieldBasis, FloatArray]:
         loss_mean, loss_max = mean_and_largest(losses(kept))
         return replace(kept, loss_mean=loss_mean, loss_max=loss_max)
 
-    exact_basis = FieldBasis(
-        mean.reshape(shape).astype(np.float32),
-        modes.reshape(-1, *shape).astype(np.float32),
-        0.0,
-        0.0,
-    )
-    common = with_step(measure(exact_basis), measure)
+    shaped = modes.reshape(-1, *shape).astype(np.float32)
+    common = FieldBasis(mean.reshape(shape).astype(np.float32), shaped, 0.0, 0.0)
+    common = with_step(measure(common), measure)
     return common, np.concatenate([rounded(numbers, common.step) for numbers in exact])

@@ -155,8 +155,8 @@ def _products(
 ) -> npt.NDArray[np.float64]:
     """Sums over rows of the products of ``(1, terms - origin)``, shape ``(1 + T, 1 + T)``.
 
-    Those of several parts add up, and what a part adds can be taken away, so each row's terms are
-    made once, whichever presses are held out.
+    The sums of several parts add up, and those of one part can be subtracted. So no row is summed
+    twice, whichever presses are held out.
     """
     found = np.zeros((1 + len(origin), 1 + len(origin)))
     for first in range(0, len(rows), _ROWS_AT_ONCE):
