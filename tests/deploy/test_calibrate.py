@@ -12,16 +12,46 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import palpate_training
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig
 from palpate.files.bundle import read_bundle
 from palpate.messages import QualityFlag
-from palpate_deploy.station.calibrate import HELD_S, PressCounter
+from palpate_deploy.station.guided_presses import HELD_S, PressCounter
+from palpate_training.datasets.experiment import read_mixed
+from palpate_training.datasets.export import features
+from palpate_training.datasets.features import write_dataset
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
 pytest.importorskip("torch")
+
+SAMPLE = Path(palpate_training.__file__).parent / "samples" / "twin.h5"
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--presses", "0"], "name presses of other fingers"),
+        (["--presses", "5"], "too few to hold some of them out"),
+        (["--presses", "0", "--from", "FILE", "--others", "FILE"], "exclude each other"),
+        (["--from", "FILE", "--others", "FILE"], "a file is named twice"),
+        (["--presses", "0", "--others", "FILE", "--others", "FILE"], "a file is named twice"),
+        (["--others", "missing.h5"], "missing.h5"),
+        (["--presses", "0", "--others", "FILE"], "FILE"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(
+    palpate: Palpate, tmp_path: Path, options: list[str], problem: str
+) -> None:
+    """Before anybody presses, and before a station is asked."""
+    (tmp_path / "FILE").write_text("no data set")
+    paths = [tmp_path / one if one == "FILE" else one for one in options]
+    done = palpate("calibrate", *paths, timeout=120)
+    assert done.returncode != 0
+    assert problem in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def count(*readings: tuple[float, float]) -> tuple[int, float]:
@@ -106,6 +136,26 @@ def test_from_presses_to_estimates(
 
     back = palpate("model", "rollback", "--sensor", "finger", "--profile", profile, timeout=240)
     assert back.returncode == 0, back.stderr
+
+    # Another finger's presses make a bundle for a finger that nobody presses.
+    others = tmp_path / "others.h5"
+    write_dataset(others, features(read_mixed(SAMPLE)))
+    unpressed = palpate(
+        *("calibrate", "finger", "--presses", "0", "--others", others, "--name", "features-guess"),
+        *("--profile", profile),
+        timeout=240,
+    )
+    assert unpressed.returncode == 0, unpressed.stderr
+    assert "UNCALIBRATED until it is pressed" in unpressed.stdout
+    with Session.open(link, station="test") as session:
+        answer = session.subscriber(FEATURES, sensor="finger").next(20).message
+    assert QualityFlag.UNCALIBRATED in answer.quality
+    itself = palpate(
+        *("calibrate", "finger", "--presses", "0", "--others", record, "--profile", profile),
+        timeout=240,
+    )
+    assert itself.returncode != 0
+    assert f"holds presses of {report['serials'][0]}, the finger itself" in itself.stderr
 
     # The record that is left is enough to do it again, as the next version, with no station.
     again = palpate("calibrate", "finger", "--from", record, "--json", timeout=240)

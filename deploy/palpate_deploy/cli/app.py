@@ -192,13 +192,26 @@ def tare(
 )
 def calibrate(
     sensor: Annotated[str, typer.Argument(help="Name of the finger.")] = "finger",
-    presses: Annotated[int, typer.Option(min=6, help="Presses to record.")] = 20,
+    presses: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Presses to record: 6 or more; 0 = none, --others alone tell of the finger."
+        ),
+    ] = 20,
     source: Annotated[
         Path | None,
         typer.Option(
             "--from",
             metavar="FILE",
             help="A record (.mcap) or data set (.h5) with presses, instead of recording them.",
+        ),
+    ] = None,
+    others: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="A record or data set with presses of other real fingers; may be repeated. They"
+            " help a finger that is like them, most where it has few presses of its own.",
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the record.")] = Path("runs/calibrate"),
@@ -239,6 +252,7 @@ def calibrate(
             None if source is None else existing_file(source),
             name,
             serve=source is None if serve is None else serve,
+            others=tuple(existing_file(one) for one in others or ()),
         ),
         token=token,
         profile=None if profile is None else load_profile(profile),

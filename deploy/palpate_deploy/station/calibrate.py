@@ -1,106 +1,44 @@
 """``palpate calibrate``: a finger's own features bundle, from presses against a force sensor.
 
 The presses are recorded first, whole, and learned from afterwards. So nothing is lost where
-something fails: ``--from`` takes the record again.
+something fails: ``--from`` takes the record again. Other fingers that were pressed before help, and
+make a bundle for a finger before it is pressed at all.
 """
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 import json
-import os
 import re
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
-from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from palpate.admin import read_token, token_file
-from palpate.bus import Delivery, Session
-from palpate.bus.topics import ELECTRODES, WRENCH, Topic
-from palpate.client.estimates import ask_tare
+from palpate.bus import Session
 from palpate.client.models import ModelAdmin
-from palpate.config import LinkConfig, parse_config
-from palpate.errors import ConfigError, LinkError, RecordingError, RemoteError, StreamTimeout
-from palpate.process import check_installed, stop_on_signals
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError
+from palpate.process import check_installed
+from palpate_deploy.station.guided_presses import record_presses, untouched
 from palpate_deploy.station.profile import Profile
-from palpate_services.config import EVERYTHING, ModelsConfig, RecorderConfig
+from palpate_services.config import ModelsConfig
 from palpate_services.inference.repository import Repository
-from palpate_services.recorder.service import run_recorder
 from palpate_training import EXTRA_MODULES
 
 if TYPE_CHECKING:
     from palpate_training.datasets.features import FeatureDataset
+    from palpate_training.learning.other_fingers import OtherFinger
     from palpate_training.tasks.finger import FingerReport
 
-PRESS_N = 0.5
-"""A force above this is a press [N]."""
-
-RELEASE_N = 0.2
-"""Below this the finger is let go [N]; as where a record is read (``TOUCH_N``)."""
-
-HELD_S = 0.3
-"""A shorter press does not count [s]."""
-
-HINTS = (
-    "straight onto the pad, gently",
-    "straight onto the pad, firmly",
-    "onto the pad, leaning to the left",
-    "onto the pad, leaning to the right",
-    "onto the tip",
-    "onto the pad, then towards the tip",
-    "onto the left side of the pad",
-    "onto the right side of the pad",
-    "far back on the pad",
-    "gently, then firmly, then gently",
-)
-"""What to do for the next press: the estimator knows nothing of what was not pressed."""
-
-_SEEN_S = 5.0
-"""A stream that brings nothing for this long is not there [s]."""
-
-_LET_GO_S = 60.0
-"""How long is waited until nobody touches the finger [s]."""
-
-_TARE_S = 10.0
-_LINE_S = 2.0
-_AGAIN_S = 0.5
-
-
-class PressCounter:
-    """Counts presses in a stream of forces: each begins, is held, and ends."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.largest_n = 0.0
-        self._since_s: float | None = None
-
-    @property
-    def pressed(self) -> bool:
-        """Whether one is under way."""
-        return self._since_s is not None
-
-    def take(self, now_s: float, force_n: float) -> bool:
-        """One reading: its time [s] and the magnitude [N]; whether it ended a press that counts."""
-        if self._since_s is None:
-            if force_n >= PRESS_N:
-                self._since_s, self.largest_n = now_s, force_n
-            return False
-        self.largest_n = max(self.largest_n, force_n)
-        if force_n >= RELEASE_N:
-            return False
-        held, self._since_s = now_s - self._since_s >= HELD_S, None
-        self.count += held
-        return held
+PRESSES_LEAST = 6
+"""Fewer cannot be held out and chosen on at once; as ``tasks.finger`` says, which needs torch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +47,12 @@ class CalibrationOrder:
 
     Attributes:
         sensor: Name of the finger at the station, or in the file.
-        presses: How many presses to record.
+        presses: How many presses to record; 0 = the finger is not pressed, others tell of it.
         out: Folder of the record.
         source: A record or data set to learn from, instead of recording one.
         name: Of the bundle; empty = by the serial number.
         serve: Whether the station serves the bundle for this finger afterwards.
+        others: Records and data sets with presses of other fingers.
     """
 
     sensor: str
@@ -122,6 +61,72 @@ class CalibrationOrder:
     source: Path | None
     name: str
     serve: bool
+    others: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.presses == 0 and self.source is not None:
+            raise ConfigError(
+                "--presses 0 and --from exclude each other: a record has presses",
+                remedy="leave one of the two out",
+            )
+        if self.presses == 0 and not self.others:
+            raise ConfigError(
+                "without presses nothing is known of the finger",
+                remedy="name presses of other fingers: --others FILE; or press this one",
+            )
+        if 0 < self.presses < PRESSES_LEAST:
+            raise ConfigError(
+                f"{self.presses} presses are too few to hold some of them out",
+                remedy=f"--presses {PRESSES_LEAST} or more; 0 with --others",
+            )
+        same = {path.resolve() for path in self.others}
+        if len(same) < len(self.others) or (self.source and self.source.resolve() in same):
+            raise ConfigError(
+                "a file is named twice", remedy="name each file once, the finger's own with --from"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class _Others:
+    """Other fingers.
+
+    Attributes:
+        fingers: Their presses.
+        serials: The serial numbers that are known of them, and where each was found.
+    """
+
+    fingers: list[OtherFinger]
+    serials: dict[str, Path]
+
+    @classmethod
+    def read(cls, paths: Sequence[Path]) -> _Others:
+        """All fingers of records and data sets.
+
+        Raises:
+            RecordingError: A record is damaged.
+            DatasetError: A file is no data set, or holds too few presses of a finger.
+        """
+        from palpate_training.tasks.other_fingers import fingers_in
+
+        fingers: list[OtherFinger] = []
+        serials: dict[str, Path] = {}
+        for path in paths:
+            data, own = _rows(path)
+            fingers += fingers_in(data)
+            serials |= dict.fromkeys(own, path)
+        return cls(fingers, serials)
+
+    def check(self, serial: str) -> None:
+        """Refuse a finger that is among the others; an unknown serial number is none.
+
+        Raises:
+            ConfigError: It is.
+        """
+        if serial in self.serials:
+            raise ConfigError(
+                f"{self.serials[serial]} holds presses of {serial}, the finger itself",
+                remedy="leave it out of --others; --from learns from it",
+            )
 
 
 def calibrate_finger(
@@ -147,23 +152,39 @@ def calibrate_finger(
         check_installed(module, extra="training")
     console = Console(stderr=as_json)
     kept = ModelsConfig() if profile is None else profile.models
-    # Before the presses: nobody wants to press twenty times for a bundle that cannot be served.
+    # Before the presses: nobody wants to press twenty times for a bundle that cannot be made, or
+    # not be served.
+    others = _Others.read(order.others)
     secret = b""
     if order.serve:
         secret = read_token(token_file(kept.memory_folder, station) if token is None else token)
     source = order.source
-    if source is None:
-        source = record_presses(link, station, order, console)
-    data, serials = _read(source, order.sensor)
-    name = order.name or f"features-{_plain(serials[0] if serials else order.sensor)}"
-    report, label, folder = _learn(data, serials, name, kept.repository_folder, console)
+    if order.presses == 0:
+        tare = untouched(link, station, order.sensor, console)
+        others.check(tare.sensor_serial)
+        serials = [tare.sensor_serial] if tare.sensor_serial else []
+        new = _NewBundle.of(order, serials, kept.repository_folder)
+        rest = tare.electrodes.astype(np.float64)
+        report = _learn_unpressed(rest, others.fingers, new, console)
+    else:
+        if source is None:
+            source = record_presses(
+                *(link, station, order.sensor, order.presses, order.out, console),
+                check=others.check,
+            )
+        data, serials = _rows(source, order.sensor)
+        for serial in serials:
+            others.check(serial)
+        new = _NewBundle.of(order, serials, kept.repository_folder)
+        report = _learn(data, serials, others.fingers, new, console)
+    label = f"{new.name}:{new.version}"
     if as_json:
         print(
             json.dumps(
                 {
                     "bundle": label,
-                    "folder": str(folder),
-                    "source": str(source),
+                    "folder": str(new.folder),
+                    "source": None if source is None else str(source),
                     "serials": serials,
                     **asdict(report),
                     "digest": report.digest.hex(),
@@ -184,222 +205,99 @@ def calibrate_finger(
         console.print(f"serve it: palpate model load {label} --sensor {order.sensor}", markup=False)
 
 
-def record_presses(
-    link: LinkConfig, station: str, order: CalibrationOrder, console: Console
-) -> Path:
-    """Guide through the presses while they are recorded; the record.
-
-    Ctrl-C ends before the last press; what was recorded then is learned from.
-
-    Raises:
-        LinkError: There is no router, or no such finger, or no force sensor for it.
-        RemoteError: The gateway takes no tare.
-        StreamTimeout: A stream ends, or the finger is not let go.
-        RecordingError: The record cannot be written.
-    """
-    interrupted = stop_on_signals()
-    with Session.open(link, station=station) as session:
-        for topic, remedy in (
-            (ELECTRODES, "see palpate status, and palpate gateway list"),
-            (WRENCH, f'give the force/torque sensor of = "{order.sensor}" in the profile'),
-        ):
-            _require_stream(session, topic, order.sensor, remedy)
-        with _recording(link, station, order) as recording:
-            console.print("let go of the finger: it is tared", markup=False)
-            _tare(session, order.sensor, interrupted)
-            if not interrupted.is_set():
-                _guide(session, order, interrupted, console, check=recording.check)
-        return recording.path()
-
-
-def _require_stream(session: Session, topic: Topic[Any], sensor: str, remedy: str) -> None:
-    with session.subscriber(topic, sensor=sensor) as stream:
-        try:
-            stream.next(_SEEN_S)
-        except StreamTimeout as error:
-            raise LinkError(
-                f"nothing comes on {topic.name} of {sensor!r} in {_SEEN_S:g} s", remedy=remedy
-            ) from error
-
-
-class _Recording:
-    """A recorder in a thread of its own.
-
-    Attributes:
-        failure: What ended it before its time; None = nothing.
-    """
-
-    def __init__(self, out: Path) -> None:
-        self._out = out
-        self._before = set(out.glob("*.mcap"))
-        self.failure: BaseException | None = None
-
-    def check(self) -> None:
-        """Raise what ended it: nobody shall press for nothing."""
-        if self.failure is not None:
-            raise self.failure
-
-    def path(self) -> Path:
-        """The finished record.
-
-        Raises:
-            RecordingError: There is none.
-        """
-        self.check()
-        new = sorted(set(self._out.glob("*.mcap")) - self._before)
-        if not new:
-            raise RecordingError(
-                f"no record was written to {self._out}", remedy="check the disk's free space"
-            )
-        return new[-1]
-
-
-@contextlib.contextmanager
-def _recording(link: LinkConfig, station: str, order: CalibrationOrder) -> Iterator[_Recording]:
-    """Record the finger inside the block."""
-    settings = {
-        **EVERYTHING,
-        "out": str(order.out),
-        "topics": ("electrodes", "wrench", "pose", "tare"),
-        "sensor": order.sensor,
-        "rrd": False,
-    }
-    config = parse_config(RecorderConfig, settings, where="command line")
-    recording, stop = _Recording(config.out), threading.Event()
-
-    def run() -> None:
-        try:
-            run_recorder(config, link, station, stop, instance=f"calibrate-{os.getpid()}")
-        except BaseException as error:
-            recording.failure = error
-
-    thread = threading.Thread(target=run, name="record", daemon=True)
-    thread.start()
-    try:
-        yield recording
-    finally:
-        stop.set()
-        thread.join()
-
-
-def _tare(session: Session, sensor: str, interrupted: threading.Event) -> None:
-    """Tare the finger as soon as nobody touches it."""
-    give_up_s = time.monotonic() + _LET_GO_S
-    while not interrupted.is_set():
-        try:
-            ask_tare(session, sensor, frames=0, timeout_s=_TARE_S)
-            return
-        except RemoteError:  # it is touched
-            if time.monotonic() >= give_up_s:
-                raise
-            interrupted.wait(_AGAIN_S)
-
-
-def _guide(
-    session: Session,
-    order: CalibrationOrder,
-    interrupted: threading.Event,
-    console: Console,
-    *,
-    check: Callable[[], None],
-) -> None:
-    """Show what to press next until enough presses are recorded; ``check`` raises what is wrong."""
-    counter, hints = PressCounter(), itertools.cycle(HINTS)
-    hint = next(hints)
-    bar = Progress(
-        TextColumn("press"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}")
-    )
-    task = bar.add_task("", total=order.presses)
-    lines_s = time.monotonic()
-    with (
-        session.subscriber(WRENCH, sensor=order.sensor, delivery=Delivery.QUEUE) as forces,
-        Live(bar, console=console, refresh_per_second=10),
-    ):
-        while counter.count < order.presses and not interrupted.is_set():
-            batch = forces.next_batch(_SEEN_S)
-            check()
-            if not batch:
-                raise StreamTimeout(
-                    f"the force of {order.sensor!r} stopped for {_SEEN_S:g} s",
-                    remedy=f"see palpate status; {order.out} keeps what was recorded, for --from",
-                )
-            for received in batch:
-                wrench = received.message
-                force_n = float(np.linalg.norm(wrench.force))
-                if counter.take(1e-9 * wrench.stamp.monotonic_ns, force_n):
-                    hint = next(hints)
-                    if not console.is_terminal:
-                        console.print(
-                            f"press {counter.count} of {order.presses}: {counter.largest_n:.1f} N",
-                            markup=False,
-                        )
-            what = "let go" if counter.pressed else hint
-            bar.update(task, completed=counter.count, description=f"{force_n:5.2f} N   {what}")
-            if not console.is_terminal and time.monotonic() >= lines_s:
-                lines_s = time.monotonic() + _LINE_S
-                console.print(f"{force_n:.2f} N, next: {what}", markup=False)
-
-
-def _read(source: Path, sensor: str) -> tuple[FeatureDataset, list[str]]:
-    """The finger's rows of a record or data set, and its serial numbers where they are known."""
+def _rows(source: Path, sensor: str | None = None) -> tuple[FeatureDataset, list[str]]:
+    """Rows of a record or data set, of one finger or all; serial numbers where they are known."""
     from palpate_training.datasets.features import open_dataset
     from palpate_training.datasets.ingest import read_streams, rows_of_streams
 
     if source.suffix != ".mcap":
         return open_dataset(source), []
     streams = read_streams(source)
-    if sensor not in streams:
-        raise ConfigError(
-            f"{source} holds no sensor {sensor!r}",
-            remedy=f"it holds: {', '.join(sorted(streams)) or 'none'}",
-        )
-    serials = sorted({frame.sensor_serial for frame in streams[sensor].frames} - {""})
-    return rows_of_streams(source, {sensor: streams[sensor]}), serials
+    if sensor is not None:
+        if sensor not in streams:
+            raise ConfigError(
+                f"{source} holds no sensor {sensor!r}",
+                remedy=f"it holds: {', '.join(sorted(streams)) or 'none'}",
+            )
+        streams = {sensor: streams[sensor]}
+    frames = (frame for each in streams.values() for frame in each.frames)
+    return rows_of_streams(source, streams), sorted({f.sensor_serial for f in frames} - {""})
+
+
+@dataclass(frozen=True, slots=True)
+class _NewBundle:
+    """Where a bundle goes: the next version of its name."""
+
+    name: str
+    version: int
+    folder: Path
+
+    @classmethod
+    def of(cls, order: CalibrationOrder, serials: Sequence[str], repository: Path) -> _NewBundle:
+        """That of a finger with these serial numbers."""
+        name = order.name or f"features-{_plain(serials[0] if serials else order.sensor)}"
+        known = [label.partition(":") for label in Repository(repository).available()]
+        version = 1 + max((int(number) for other, _, number in known if other == name), default=0)
+        return cls(name, version, repository / name / str(version))
 
 
 def _learn(
     data: FeatureDataset,
-    serials: list[str],
-    name: str,
-    bundles: Path,
+    serials: Sequence[str],
+    others: Sequence[OtherFinger],
+    new: _NewBundle,
     console: Console,
-) -> tuple[FingerReport, str, Path]:
+) -> FingerReport:
     from palpate_training.tasks.finger import STEPS, train_finger
 
-    known = [label.partition(":") for label in Repository(bundles).available()]
-    version = 1 + max((int(number) for other, _, number in known if other == name), default=0)
-    folder = bundles / name / str(version)
     with Progress(
         TextColumn("learn, and hold presses out"), BarColumn(), console=console
     ) as progress:
         task = progress.add_task("", total=STEPS)
-        report = train_finger(
+        return train_finger(
             data,
-            folder,
-            name=name,
-            version=version,
+            new.folder,
+            name=new.name,
+            version=new.version,
             serials=serials,
+            others=others,
             on_step=lambda: progress.advance(task),
         )
-    return report, f"{name}:{version}", folder
+
+
+def _learn_unpressed(
+    rest: npt.NDArray[np.float64],
+    others: Sequence[OtherFinger],
+    new: _NewBundle,
+    console: Console,
+) -> FingerReport:
+    from palpate_training.tasks.other_fingers import train_unpressed
+
+    with console.status("learn from other fingers, each left out in its turn"):
+        return train_unpressed(others, rest, new.folder, name=new.name, version=new.version)
 
 
 def _show(report: FingerReport, label: str, console: Console) -> None:
+    from palpate_training.tasks.finger import LIKE_OTHERS
+
     found = report.metrics
     table = Table(title=label, title_justify="left")
-    table.add_column(f"{report.presses} presses, each held out")
+    of = f"{report.presses} presses, each held out" if report.presses else "on other fingers"
+    table.add_column(of)
     table.add_column("magnitude [N]", justify="right")
     table.add_column("angle [rad]", justify="right")
     for words, prefix in (
         ("this bundle", ""),
         ("a line", "linear_"),
+        ("other fingers alone", "others_"),
         ("always the mean", "constant_"),
     ):
-        table.add_row(
-            words,
-            f"{found[f'{prefix}force_magnitude_median_n']:.3f}",
-            f"{found[f'{prefix}force_angle_median_rad']:.3f}",
-        )
+        if f"{prefix}force_magnitude_median_n" in found:
+            table.add_row(
+                words,
+                f"{found[f'{prefix}force_magnitude_median_n']:.3f}",
+                f"{found[f'{prefix}force_angle_median_rad']:.3f}",
+            )
     console.print(table)
     console.print(
         f"medians; 95 % of the magnitudes within {found['force_magnitude_p95_n']:.2f} N\n"
@@ -407,6 +305,18 @@ def _show(report: FingerReport, label: str, console: Console) -> None:
         f"it holds: {report.estimator}",
         markup=False,
     )
+    if report.presses == 0:
+        console.print(
+            "nobody knows how far this finger is like the others: its estimates are flagged"
+            " UNCALIBRATED until it is pressed (palpate calibrate)",
+            markup=False,
+        )
+    elif report.others is not None and report.others > LIKE_OTHERS:
+        console.print(
+            f"the other fingers were left out: alone they are off by {report.others:.2f} of the"
+            f" force and 0.5 N, median, more than {LIKE_OTHERS:g}: this finger is not like them",
+            markup=False,
+        )
 
 
 def _plain(serial: str) -> str:

@@ -101,16 +101,21 @@ class ForceProcesses(nn.Module):
     def __init__(self, rows: KnownRows, rest: Floats, *, local: float) -> None:
         super().__init__()
         self.line = ForceLine(rows)
-        self.twin = _OwnLine(read_line(), rows, rest)
-        with torch.inference_mode():
-            known = self.twin(torch.from_numpy(rows.tared)).numpy()
-        left = KnownRows(rows.tared, rows.force - known, rows.press)
-        self.magnitude, self.direction = (
-            nn.ModuleList(
-                _CommonModeProcess(some, rest, common=one, local=local) for one in commons
+        twin = read_line()
+        guess = twin.force(rest + rows.tared, rest)
+        own = twin.mapped(guess, rows.force, penalty_n2=MAP_PENALTY_N2)
+        self.twin = MappedLine(own, rest)
+        left = rows.force - own.force(rest + rows.tared, rest)
+
+        def processes(wanted: Floats, commons: tuple[float, ...]) -> nn.ModuleList:
+            inputs = {one: changes_of(rows.tared, rest, one) for one in commons}
+            return nn.ModuleList(
+                CommonModeProcess(inputs[one], wanted, rest, common=one, local=local)
+                for one in commons
             )
-            for some, commons in ((left, _COMMON_OF_MAGNITUDE), (rows, _COMMON_OF_DIRECTION))
-        )
+
+        self.magnitude = processes(left, _COMMON_OF_MAGNITUDE)
+        self.direction = processes(rows.force, _COMMON_OF_DIRECTION)
 
     def forward(self, tared: Tensor) -> Tensor:
         """Forces [N]."""
@@ -118,72 +123,71 @@ class ForceProcesses(nn.Module):
         parts = [self.line(tared).double(), *(twin + process(tared) for process in self.magnitude)]
         mean = torch.stack(parts).mean(dim=0)
         magnitude = torch.linalg.vector_norm(mean, dim=1, keepdim=True)
-        direction = torch.stack([_unit(process(tared)) for process in self.direction])
-        force: Tensor = magnitude * _unit(direction.sum(dim=0))
+        direction = torch.stack([unit(process(tared)) for process in self.direction])
+        force: Tensor = magnitude * unit(direction.sum(dim=0))
         return force.float()
 
 
-class _OwnLine(nn.Module):
-    """A line through the twin, mapped to a finger by rows of it."""
+class MappedLine(nn.Module):
+    """A line through the twin, mapped to real fingers, as one of them reads: tared counts -> force.
+
+    Args:
+        line: The mapped line.
+        rest: Untouched counts of the finger, shape (19,).
+    """
 
     rest: Tensor
-    log_rest: Tensor
     weight: Tensor
     offset: Tensor
 
-    def __init__(self, line: TwinLine, rows: KnownRows, rest: Floats) -> None:
+    def __init__(self, line: TwinLine, rest: Floats) -> None:
         super().__init__()
         for name, values in (("rest", rest), ("weight", line.weight), ("offset", line.offset)):
             self.register_buffer(name, torch.from_numpy(values))
-        self.register_buffer("log_rest", log_impedance(self.rest))
-        with torch.inference_mode():
-            guess = self(torch.from_numpy(rows.tared)).numpy()
-        own = line.mapped(guess, rows.force, penalty_n2=MAP_PENALTY_N2)
-        self.weight, self.offset = torch.from_numpy(own.weight), torch.from_numpy(own.offset)
 
     def forward(self, tared: Tensor) -> Tensor:
         """Forces [N], shape (N, 3), double."""
-        rise = log_impedance(self.rest + tared.double()) - self.log_rest
-        force: Tensor = (rise - rise.mean(dim=1, keepdim=True)) @ self.weight + self.offset
+        force: Tensor = _changes(tared.double(), self.rest, 0.0) @ self.weight + self.offset
         return force
 
 
-class _CommonModeProcess(nn.Module):
-    """Gaussian process whose inputs keep a share of the electrodes' common mode."""
+class CommonModeProcess(nn.Module):
+    """Gaussian process whose inputs keep a share of the electrodes' common mode.
 
-    log_rest: Tensor
+    Args:
+        inputs: What it is fitted to, of any finger, as ``changes_of`` gives them, shape (M, 19).
+        wanted: What it estimates there, shape (M, K).
+        rest: Untouched counts of the finger that it will estimate for, shape (19,).
+        common: Share of the common mode, that of ``inputs``.
+        local: As that of ``ForceProcesses``.
+    """
+
     rest: Tensor
     spread: Tensor
     rows: Tensor
     weight: Tensor
     offset: Tensor
 
-    def __init__(self, rows: KnownRows, rest: Floats, *, common: float, local: float) -> None:
+    def __init__(
+        self, inputs: Floats, wanted: Floats, rest: Floats, *, common: float, local: float
+    ) -> None:
         super().__init__()
         self._common, self._local = common, local
         self.register_buffer("rest", torch.from_numpy(rest))
-        self.register_buffer("log_rest", log_impedance(self.rest))
-        self.register_buffer("spread", torch.ones(len(rest), dtype=torch.float64))
-        with torch.inference_mode():
-            inputs = self._inputs(torch.from_numpy(rows.tared))
-            self.spread = torch.from_numpy(_spread(inputs.numpy()))
-            inputs = inputs / self.spread
-            force = torch.from_numpy(rows.force)
-            mean = force.mean(dim=0)
-            noise = NOISE * torch.eye(len(rows), dtype=torch.float64)
-            root = torch.linalg.cholesky(self._covariance(inputs, inputs) + noise)
-            weight = torch.cholesky_solve(force - mean, root)
-        self.register_buffer("rows", inputs)
-        self.register_buffer("weight", weight)
+        self.register_buffer("spread", torch.from_numpy(_spread(inputs)))
+        rows = torch.from_numpy(inputs) / self.spread
+        targets = torch.from_numpy(wanted)
+        mean = targets.mean(dim=0)
+        noise = NOISE * torch.eye(len(rows), dtype=torch.float64)
+        root = torch.linalg.cholesky(self._covariance(rows, rows) + noise)
+        self.register_buffer("rows", rows)
+        self.register_buffer("weight", torch.cholesky_solve(targets - mean, root))
         self.register_buffer("offset", mean)
 
     def forward(self, tared: Tensor) -> Tensor:
-        inputs = self._inputs(tared.double()) / self.spread
+        """Estimates of tared counts (N, 19), shape (N, K), double."""
+        inputs = _changes(tared.double(), self.rest, self._common) / self.spread
         return self._covariance(inputs, self.rows) @ self.weight + self.offset
-
-    def _inputs(self, tared: Tensor) -> Tensor:
-        rise = log_impedance(self.rest + tared) - self.log_rest
-        return rise - (1.0 - self._common) * rise.mean(dim=1, keepdim=True)
 
     def _covariance(self, a: Tensor, b: Tensor) -> Tensor:
         product = a @ b.T
@@ -193,12 +197,29 @@ class _CommonModeProcess(nn.Module):
         return local + LINEAR / size * product
 
 
+def changes_of(tared: Floats, rest: Floats, common: float) -> Floats:
+    """Changes of the logarithms of the impedances of rows since rest, shape (N, 19).
+
+    Args:
+        tared: Tared counts, shape (N, 19).
+        rest: Untouched counts, shape (19,).
+        common: Share of the common mode that is kept.
+    """
+    return np.asarray(_changes(torch.from_numpy(tared), torch.from_numpy(rest), common).numpy())
+
+
+def _changes(tared: Tensor, rest: Tensor, common: float) -> Tensor:
+    change = log_impedance(rest + tared) - log_impedance(rest)
+    return change - (1.0 - common) * change.mean(dim=1, keepdim=True)
+
+
 def _spread(inputs: Floats) -> Floats:
     """Of each input; one that never changes counts with one."""
     spread = inputs.std(axis=0)
     return np.where(spread > 0.0, spread, 1.0)
 
 
-def _unit(vectors: Tensor) -> Tensor:
+def unit(vectors: Tensor) -> Tensor:
+    """Vectors (N, 3) of length one."""
     length: Tensor = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
     return vectors / length.clamp(min=1e-12)

@@ -3,15 +3,18 @@
 The bundle estimates the force of this one finger. Which estimator it holds is chosen on presses
 that are held out, and what is said of it is measured on others, held out from that choice, too. A
 finger that the network of a simulated population knows best, once it is told these presses, gets
-that network's contact location, centre of pressure and contact normal as well.
+that network's contact location, centre of pressure and contact normal as well. Where other fingers
+are given that were pressed before, a finger like them is estimated by them and by its own presses
+together; or by them alone, before it is pressed at all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +35,7 @@ from palpate_training.learning.force_process import (
 from palpate_training.learning.graphs import FeaturesGraph
 from palpate_training.learning.intervals import LEVEL, bounds, fit_formulas, terms_of, widened
 from palpate_training.learning.metrics import force_errors, force_metrics
+from palpate_training.learning.other_fingers import OtherFinger, OtherFingers, SharedForce
 from palpate_training.learning.ranges import ends_of, known_inputs
 from palpate_training.learning.told_finger import ToldFinger
 from palpate_training.tasks.features import threshold_above
@@ -83,7 +87,14 @@ ESTIMATORS: dict[str, Estimator] = {
     },
     TOLD: ToldFinger,
 }
-"""What is chosen from."""
+"""What is chosen from, where no other fingers are given."""
+
+SHARED = "other fingers and its own presses"
+
+LIKE_OTHERS = 0.35
+"""A finger is like other ones if these alone, without a press of it, are off by no more than so
+much of 0.5 N and the force, median over the rows of its presses: 0.06 to 0.24 from one LASA finger
+to the other, 0.51 and more from these to simulated specimens (docs/results/calibrate.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +107,7 @@ class FingerReport:
         metrics: On presses held out, as in the manifest.
         presses: How many presses it learned from.
         rows: Rows that it was fitted to.
+        others: How unlike other fingers it is, as ``LIKE_OTHERS`` counts; None = none were given.
     """
 
     digest: bytes
@@ -103,6 +115,7 @@ class FingerReport:
     metrics: dict[str, float]
     presses: int
     rows: int
+    others: float | None = None
 
 
 def train_finger(
@@ -112,6 +125,7 @@ def train_finger(
     name: str,
     version: int = 1,
     serials: Sequence[str] = (),
+    others: Sequence[OtherFinger] = (),
     on_step: Callable[[], None] = lambda: None,
 ) -> FingerReport:
     """Fit to the presses of one finger, measure on presses held out, and write the bundle.
@@ -122,6 +136,7 @@ def train_finger(
         name: Of the bundle.
         version: Of the bundle.
         serials: Serial numbers of the finger, so that no other one is taken for calibrated.
+        others: Fingers that were pressed before; they count only if this finger is like them.
         on_step: Called ``STEPS`` times, for a progress bar.
 
     Raises:
@@ -131,80 +146,169 @@ def train_finger(
     refuse_existing(folder)
     known, touched = known_rows(data)
     rest = data.baseline.mean(axis=0, dtype=np.float64)
+    met = OtherFingers(others, rest) if others else None
+    foreign = None if met is None else unlike_others(met, known)
     held_out = np.zeros_like(known.force)
     lines, constants = np.zeros_like(known.force), np.zeros_like(known.force)
     for out in _folds(known.press, FOLDS):
         fitted = known.where(~out)
-        held_out[out] = estimate_of(fit_finger(fitted, rest)[1], known.tared[out])
+        held_out[out] = estimate_of(fit_finger(fitted, rest, met)[1], known.tared[out])
         lines[out] = estimate_of(ForceLine(fitted), known.tared[out])
         constants[out] = fitted.force[touched[~out]].mean(axis=0)
         on_step()
-    estimator, net = fit_finger(known, rest)
-    force_sd = _force_sd(held_out - known.force, known.press)
+    estimator, net = fit_finger(known, rest, met)
     on_step()
-    untouched_n = np.linalg.norm(held_out[~touched], axis=1)
-    threshold = threshold_above(untouched_n) if len(untouched_n) else _THRESHOLD_UNKNOWN_N
-    metrics = force_metrics(held_out[touched], known.force[touched])
-    errors = force_errors(held_out[touched], known.force[touched])
-    metrics["force_magnitude_p95_n"] = float(np.percentile(errors["magnitude_n"], 95.0))
-    metrics["coverage_90"] = float(
-        np.mean(np.abs(held_out - known.force)[touched] <= _DEVIATIONS * force_sd)
-    )
-    for other, estimate in (("constant", constants), ("linear", lines)):
-        found = force_metrics(estimate[touched], known.force[touched])
-        for key in ("force_magnitude_median_n", "force_angle_median_rad"):
-            metrics[f"{other}_{key}"] = found[key]
+    rivals = {"constant": constants, "linear": lines}
+    if met is not None:
+        rivals["others"] = estimate_of(met, known.tared)
     presses = len(np.unique(known.press[touched]))
     source = f"{len(known)} rows of {data.provenance.source}"
     # A finger that the network knows is like simulated ones, so more is known of it.
     told = net.told if isinstance(net, ToldFinger) else None
-    formulas = finger_formulas(
-        held_out[touched],
-        known.force[touched],
-        known.press[touched],
-        follow=told.bounds["force_magnitude"] if told else None,
-    )
-    described: dict[str, str] = {}
+    follow = told.bounds["force_magnitude"] if told else None
+    said = HeldOutPresses.of(held_out, known, touched, rivals, follow=follow)
     if told:
-        formulas = (*formulas, told.bounds["contact_location"])
-        described["of a contact"] = f"of the network; errors are those on {told.source}"
-    digest = export_features(
+        said = replace(said, formulas=(*said.formulas, told.bounds["contact_location"]))
+    digest = write_finger(
         folder,
-        FeaturesGraph(net, force_sd.astype(np.float32), told.contact_sd if told else None),
-        known.tared[np.linspace(0, len(known) - 1, _GOLDEN_ROWS).astype(int)].astype(np.float32),
+        net,
+        known,
+        said,
+        estimator=estimator,
+        source=source,
+        held_out_as="each press held out in its turn",
+        data_sha256=data.content_sha256(),
+        contact_sd=told.contact_sd if told else None,
+        normalisation={"of a contact": f"of the network; errors are those on {told.source}"}
+        if told
+        else {},
         name=name,
         version=version,
-        contact_threshold_n=threshold,
-        training_data_sha256=data.content_sha256(),
+        sensor_serials=tuple(serials),
         trained_on=f"{data.provenance.source}: {presses} presses; measured on presses held out",
-        metrics=metrics,
+    )
+    return FingerReport(digest, estimator, said.metrics, presses, len(known), foreign)
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOutPresses:
+    """What is said of a bundle, from presses that were held out.
+
+    Attributes:
+        metrics: As in the manifest.
+        force_sd: Per axis, so that ``LEVEL`` of the next press's errors lie within 1.645 of it [N].
+        threshold_n: Below this estimated force there is no contact [N].
+        formulas: Bounds of errors.
+        presses: How many presses.
+    """
+
+    metrics: dict[str, float]
+    force_sd: Floats
+    threshold_n: float
+    formulas: tuple[BoundFormula, ...]
+    presses: int
+
+    @classmethod
+    def of(
+        cls,
+        estimate: Floats,
+        known: KnownRows,
+        touched: npt.NDArray[np.bool_],
+        rivals: Mapping[str, Floats],
+        *,
+        follow: BoundFormula | None = None,
+    ) -> HeldOutPresses:
+        """From estimates of presses, each made without that press.
+
+        Args:
+            estimate: Forces [N], shape ``(N, 3)``.
+            known: The same rows.
+            touched: Which of them are touched, shape ``(N,)``.
+            rivals: What other estimators say of these rows, by name.
+            follow: How bounds follow a frame; None = as these presses say.
+        """
+        force_sd = _force_sd(estimate - known.force, known.press)
+        untouched_n = np.linalg.norm(estimate[~touched], axis=1)
+        truth, press = known.force[touched], known.press[touched]
+        metrics = force_metrics(estimate[touched], truth)
+        errors = force_errors(estimate[touched], truth)
+        metrics["force_magnitude_p95_n"] = float(np.percentile(errors["magnitude_n"], 95.0))
+        within = np.abs(estimate - known.force)[touched] <= _DEVIATIONS * force_sd
+        metrics["coverage_90"] = float(within.mean())
+        for name, other in rivals.items():
+            found = force_metrics(other[touched], truth)
+            for key in ("force_magnitude_median_n", "force_angle_median_rad"):
+                metrics[f"{name}_{key}"] = found[key]
+        return cls(
+            metrics,
+            force_sd,
+            threshold_above(untouched_n) if len(untouched_n) else _THRESHOLD_UNKNOWN_N,
+            finger_formulas(estimate[touched], truth, press, follow=follow),
+            len(np.unique(press)),
+        )
+
+
+def write_finger(
+    folder: Path,
+    net: nn.Module,
+    rows: KnownRows,
+    said: HeldOutPresses,
+    *,
+    estimator: str,
+    source: str,
+    held_out_as: str,
+    data_sha256: str,
+    contact_sd: Mapping[str, npt.NDArray[np.float32]] | None = None,
+    normalisation: Mapping[str, str] | None = None,
+    **described: Any,
+) -> bytes:
+    """Write the bundle of one finger, or nothing; its digest, 32 bytes.
+
+    Args:
+        folder: Of the bundle; must not exist.
+        net: Tared counts ``(N, 19)`` -> force [N], and of a contact what ``contact_sd`` names.
+        rows: The training range.
+        said: What is said of it.
+        estimator: Which kind it is, for people.
+        source: Of the rows, for people.
+        held_out_as: How presses were held out, for people.
+        data_sha256: Content of what was learned from.
+        contact_sd: As ``FeaturesGraph`` takes it.
+        normalisation: More words for the manifest.
+        described: Name, version and so on for the manifest, as ``export_features`` takes them.
+
+    Raises:
+        BundleError: The folder exists, or parity fails; nothing is left on disk.
+    """
+    golden = np.linspace(0, len(rows) - 1, _GOLDEN_ROWS).astype(int)
+    bounds_of = f"{source}, {held_out_as}"
+    return export_features(
+        folder,
+        FeaturesGraph(net, said.force_sd.astype(np.float32), contact_sd),
+        rows.tared[golden].astype(np.float32),
+        contact_threshold_n=said.threshold_n,
+        training_data_sha256=data_sha256,
+        metrics=said.metrics,
         normalisation={
             "estimator": estimator,
             "force_sd": f"{LEVEL:.0%} of the errors on presses held out, axis by axis, are within"
             f" {_DEVIATIONS:.3f} of it",
-            **described,
+            **(normalisation or {}),
         },
         training_range=TrainingRange(
             source=source,
-            data_sha256=data.content_sha256(),
-            rows=len(known),
-            inputs=(ends_of("electrodes", "tared counts", known.tared),),
-            outputs=(ends_of("force", "N", known.force),),
+            data_sha256=data_sha256,
+            rows=len(rows),
+            inputs=(ends_of("electrodes", "tared counts", rows.tared),),
+            outputs=(ends_of("force", "N", rows.force),),
             combinations=True,
         ),
-        known_inputs=known_inputs(known.tared.astype(np.float32), known.press),
-        sensor_serials=tuple(serials),
-        intervals=Intervals(
-            LEVEL,
-            f"{source}, each press held out in its turn",
-            data.content_sha256(),
-            presses,
-            formulas,
-        )
-        if formulas
+        known_inputs=known_inputs(rows.tared.astype(np.float32), rows.press),
+        intervals=Intervals(LEVEL, bounds_of, data_sha256, said.presses, said.formulas)
+        if said.formulas
         else None,
+        **described,
     )
-    return FingerReport(digest, estimator, metrics, presses, len(known))
 
 
 STEPS = FOLDS + 1
@@ -301,16 +405,32 @@ def _folds(press: Rows, count: int) -> list[npt.NDArray[np.bool_]]:
     return [np.isin(press, part) for part in np.array_split(np.unique(press), count)]
 
 
-def fit_finger(rows: KnownRows, rest: Floats) -> tuple[str, nn.Module]:
+def fit_finger(
+    rows: KnownRows, rest: Floats, others: OtherFingers | None = None
+) -> tuple[str, nn.Module]:
     """The estimator that is the best on presses held out; its name, and it itself.
+
+    Other fingers that the finger is like come first, whatever presses held out say: these are
+    neighbours in time of those that were learned from, and so flatter what learned from no others.
 
     Args:
         rows: Of at least three presses.
         rest: Untouched counts, shape (19,).
+        others: What other fingers taught, for this one.
     """
     errors = {name: held_out_errors(one, rows, rest) for name, one in ESTIMATORS.items()}
     best = chosen(errors, rows.force)
+    if others is not None and unlike_others(others, rows) <= LIKE_OTHERS:
+        shared = partial(SharedForce, others)
+        if best != TOLD or held_out_errors(shared, rows, rest).mean() < errors[TOLD].mean():
+            return SHARED, shared(rows, rest)
     return best, ESTIMATORS[best](rows, rest)
+
+
+def unlike_others(others: OtherFingers, rows: KnownRows) -> float:
+    """How unlike other fingers a finger is, of whose presses they know nothing: ``LIKE_OTHERS``."""
+    estimate = estimate_of(others, rows.tared)
+    return unlike(np.linalg.norm(estimate - rows.force, axis=1), rows.force)
 
 
 def held_out_errors(estimator: Estimator, rows: KnownRows, rest: Floats) -> Floats:

@@ -1,0 +1,280 @@
+"""Presses of a finger, guided and recorded while they are made; and its tare."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from palpate.bus import Delivery, Session
+from palpate.bus.topics import ELECTRODES, WRENCH, Topic
+from palpate.client.estimates import ask_tare
+from palpate.config import LinkConfig, parse_config
+from palpate.errors import LinkError, RecordingError, RemoteError, StreamTimeout
+from palpate.messages import Tare
+from palpate.process import stop_on_signals
+from palpate_services.config import EVERYTHING, RecorderConfig
+from palpate_services.recorder.service import run_recorder
+
+Message = TypeVar("Message")
+
+PRESS_N = 0.5
+"""A force above this is a press [N]."""
+
+RELEASE_N = 0.2
+"""Below this the finger is let go [N]; as where a record is read (``TOUCH_N``)."""
+
+HELD_S = 0.3
+"""A shorter press does not count [s]."""
+
+HINTS = (
+    "straight onto the pad, gently",
+    "straight onto the pad, firmly",
+    "onto the pad, leaning to the left",
+    "onto the pad, leaning to the right",
+    "onto the tip",
+    "onto the pad, then towards the tip",
+    "onto the left side of the pad",
+    "onto the right side of the pad",
+    "far back on the pad",
+    "gently, then firmly, then gently",
+)
+"""What to do for the next press: the estimator knows nothing of what was not pressed."""
+
+_SEEN_S = 5.0
+"""A stream that brings nothing for this long is not there [s]."""
+
+_LET_GO_S = 60.0
+"""How long is waited until nobody touches the finger [s]."""
+
+_TARE_S = 10.0
+_LINE_S = 2.0
+_AGAIN_S = 0.5
+
+
+class PressCounter:
+    """Counts presses in a stream of forces: each begins, is held, and ends."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.largest_n = 0.0
+        self._since_s: float | None = None
+
+    @property
+    def pressed(self) -> bool:
+        """Whether one is under way."""
+        return self._since_s is not None
+
+    def take(self, now_s: float, force_n: float) -> bool:
+        """One reading: its time [s] and the magnitude [N]; whether it ended a press that counts."""
+        if self._since_s is None:
+            if force_n >= PRESS_N:
+                self._since_s, self.largest_n = now_s, force_n
+            return False
+        self.largest_n = max(self.largest_n, force_n)
+        if force_n >= RELEASE_N:
+            return False
+        held, self._since_s = now_s - self._since_s >= HELD_S, None
+        self.count += held
+        return held
+
+
+def untouched(link: LinkConfig, station: str, sensor: str, console: Console) -> Tare:
+    """The finger's state as it is let go.
+
+    Raises:
+        LinkError: There is no router, or no such finger.
+        RemoteError: The gateway takes no tare.
+    """
+    with Session.open(link, station=station) as session:
+        _first(session, ELECTRODES, sensor, _NO_ELECTRODES)
+        console.print("let go of the finger: it is tared", markup=False)
+        tare = _tare(session, sensor, threading.Event())
+        assert tare is not None, "nothing interrupts it"
+        return tare
+
+
+def record_presses(
+    link: LinkConfig,
+    station: str,
+    sensor: str,
+    presses: int,
+    out: Path,
+    console: Console,
+    *,
+    check: Callable[[str], None] = lambda _: None,
+) -> Path:
+    """Guide through so many presses while they are recorded; the record.
+
+    Ctrl-C ends before the last press; what was recorded then is learned from.
+
+    Args:
+        link: To the router.
+        station: Name of the station.
+        sensor: Name of the finger.
+        presses: How many.
+        out: Folder of the record.
+        console: Where the guide is shown.
+        check: Given the finger's serial number before it is pressed; may refuse it.
+
+    Raises:
+        LinkError: There is no router, or no such finger, or no force sensor for it.
+        RemoteError: The gateway takes no tare.
+        StreamTimeout: A stream ends, or the finger is not let go.
+        RecordingError: The record cannot be written.
+    """
+    interrupted = stop_on_signals()
+    with Session.open(link, station=station) as session:
+        check(_first(session, ELECTRODES, sensor, _NO_ELECTRODES).sensor_serial)
+        no_force = f'give the force/torque sensor of = "{sensor}" in the profile'
+        _first(session, WRENCH, sensor, no_force)
+        with _recording(link, station, sensor, out) as recording:
+            console.print("let go of the finger: it is tared", markup=False)
+            _tare(session, sensor, interrupted)
+            if not interrupted.is_set():
+                _guide(session, sensor, presses, out, interrupted, console, check=recording.check)
+        return recording.path()
+
+
+_NO_ELECTRODES = "see palpate status, and palpate gateway list"
+
+
+def _first(session: Session, topic: Topic[Message], sensor: str, remedy: str) -> Message:
+    """The first message of a stream that must be there."""
+    with session.subscriber(topic, sensor=sensor) as stream:
+        try:
+            return stream.next(_SEEN_S).message
+        except StreamTimeout as error:
+            raise LinkError(
+                f"nothing comes on {topic.name} of {sensor!r} in {_SEEN_S:g} s", remedy=remedy
+            ) from error
+
+
+class _Recording:
+    """A recorder in a thread of its own.
+
+    Attributes:
+        failure: What ended it before its time; None = nothing.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self._out = out
+        self._before = set(out.glob("*.mcap"))
+        self.failure: BaseException | None = None
+
+    def check(self) -> None:
+        """Raise what ended it: nobody shall press for nothing."""
+        if self.failure is not None:
+            raise self.failure
+
+    def path(self) -> Path:
+        """The finished record.
+
+        Raises:
+            RecordingError: There is none.
+        """
+        self.check()
+        new = sorted(set(self._out.glob("*.mcap")) - self._before)
+        if not new:
+            raise RecordingError(
+                f"no record was written to {self._out}", remedy="check the disk's free space"
+            )
+        return new[-1]
+
+
+@contextlib.contextmanager
+def _recording(link: LinkConfig, station: str, sensor: str, out: Path) -> Iterator[_Recording]:
+    """Record the finger inside the block."""
+    settings = {
+        **EVERYTHING,
+        "out": str(out),
+        "topics": ("electrodes", "wrench", "pose", "tare"),
+        "sensor": sensor,
+        "rrd": False,
+    }
+    config = parse_config(RecorderConfig, settings, where="command line")
+    recording, stop = _Recording(config.out), threading.Event()
+
+    def run() -> None:
+        try:
+            run_recorder(config, link, station, stop, instance=f"calibrate-{os.getpid()}")
+        except BaseException as error:
+            recording.failure = error
+
+    thread = threading.Thread(target=run, name="record", daemon=True)
+    thread.start()
+    try:
+        yield recording
+    finally:
+        stop.set()
+        thread.join()
+
+
+def _tare(session: Session, sensor: str, interrupted: threading.Event) -> Tare | None:
+    """Tare the finger as soon as nobody touches it; None = interrupted."""
+    give_up_s = time.monotonic() + _LET_GO_S
+    while not interrupted.is_set():
+        try:
+            return ask_tare(session, sensor, frames=0, timeout_s=_TARE_S)
+        except RemoteError:  # it is touched
+            if time.monotonic() >= give_up_s:
+                raise
+            interrupted.wait(_AGAIN_S)
+    return None
+
+
+def _guide(
+    session: Session,
+    sensor: str,
+    presses: int,
+    out: Path,
+    interrupted: threading.Event,
+    console: Console,
+    *,
+    check: Callable[[], None],
+) -> None:
+    """Show what to press next until enough presses are recorded; ``check`` raises what is wrong."""
+    counter, hints = PressCounter(), itertools.cycle(HINTS)
+    hint = next(hints)
+    bar = Progress(
+        TextColumn("press"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}")
+    )
+    task = bar.add_task("", total=presses)
+    lines_s = time.monotonic()
+    with (
+        session.subscriber(WRENCH, sensor=sensor, delivery=Delivery.QUEUE) as forces,
+        Live(bar, console=console, refresh_per_second=10),
+    ):
+        while counter.count < presses and not interrupted.is_set():
+            batch = forces.next_batch(_SEEN_S)
+            check()
+            if not batch:
+                raise StreamTimeout(
+                    f"the force of {sensor!r} stopped for {_SEEN_S:g} s",
+                    remedy=f"see palpate status; {out} keeps what was recorded, for --from",
+                )
+            for received in batch:
+                wrench = received.message
+                force_n = float(np.linalg.norm(wrench.force))
+                if counter.take(1e-9 * wrench.stamp.monotonic_ns, force_n):
+                    hint = next(hints)
+                    if not console.is_terminal:
+                        console.print(
+                            f"press {counter.count} of {presses}: {counter.largest_n:.1f} N",
+                            markup=False,
+                        )
+            what = "let go" if counter.pressed else hint
+            bar.update(task, completed=counter.count, description=f"{force_n:5.2f} N   {what}")
+            if not console.is_terminal and time.monotonic() >= lines_s:
+                lines_s = time.monotonic() + _LINE_S
+                console.print(f"{force_n:.2f} N, next: {what}", markup=False)
