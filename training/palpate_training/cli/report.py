@@ -133,7 +133,7 @@ def train_evaluate(
 ) -> None:
     """Errors of a bundle on data sets, by force, with confidence intervals over presses.
 
-    palpate train evaluate models/features-twin/11 runs/test/mixed.h5
+    palpate train evaluate models/features-twin/12 runs/test/mixed.h5
     """
     from palpate_training.tasks.evaluate import evaluate
 
