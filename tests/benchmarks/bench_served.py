@@ -12,6 +12,7 @@ requests: every caller has to get its answer, from the CPU's workers or from the
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import shlex
@@ -28,7 +29,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tests.benchmarks.bench_batched import presses_on, say, time_slots
 
 from palpate.bus import run_router
 from palpate.client import Client
@@ -39,6 +39,9 @@ from palpate_fem.indenter.catalogue import indenter_names
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.service.requests import as_pose
+
+beside: Any = importlib.import_module("bench_batched")  # in this folder
+presses_on, say, time_slots = beside.presses_on, beside.say, beside.time_slots
 
 PATIENCE_S = 900.0
 ANSWER_S = 300.0
@@ -95,10 +98,7 @@ def ask(
     waiting = iter(enumerate(presses))
     lock, begun = threading.Lock(), time.perf_counter()
     answers: list[dict[str, Any]] = []
-    clients = [
-        Client(endpoint, timeout_s=20.0)
-        for _ in range(-(-callers // CALLERS_OF_SESSION))
-    ]
+    clients = [Client(endpoint, timeout_s=20.0) for _ in range(-(-callers // CALLERS_OF_SESSION))]
 
     def call(client: Client) -> None:
         while True:
