@@ -5,8 +5,8 @@
 The service runs as a process of its own (``palpate fem serve --device``), behind a router on the
 loopback interface; each caller is a thread that asks for one press after the other, as
 ``bench_batched`` makes them. ``bare`` is what the device takes for the same presses in this
-process, with nothing between. At the end the device's process is killed (SIGKILL) in the midst of
-requests: every caller has to get its answer, from the CPU's workers or from the next process.
+process, with nothing between. With ``--kill`` the device's process is killed (SIGKILL) among
+requests at the end: every caller has to get its answer, from the CPU's workers or the next process.
 """
 
 from __future__ import annotations
@@ -180,6 +180,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=float, default=3.0, help="presses for each caller")
     parser.add_argument("--slots", type=int, default=64)
     parser.add_argument("--edge-mm", type=float, default=0.47)
+    parser.add_argument("--kill", action="store_true", help="at the end kill the device's process")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     report: dict[str, Any] = {
@@ -203,8 +204,9 @@ def main() -> None:
         with service(endpoint, options.device, options.edge_mm, options.slots) as parent:
             for many, count in counts.items():
                 keep("served", ask(endpoint, presses[:count], many))
-            count, victim = counts[many], device_process(parent)
-            keep("served", ask(endpoint, presses[:count], many, kill=victim))
+            if options.kill:
+                victim = device_process(parent)
+                keep("served", ask(endpoint, presses[: counts[many]], many, kill=victim))
     for many, count in counts.items():
         run, _ = time_slots(
             tip, presses[:count], min(many, options.slots), options.device, parts=False

@@ -212,3 +212,37 @@ def test_a_replica_with_other_parameters_does_not_answer(own_bus: LinkConfig) ->
         until(lambda: (found := other()) and found.state is ServiceState.READY)
         robot.simulate(fakes.request("the other"), timeout_s=PATIENCE_S)
         assert other().counters.get("requests_received") == 1
+
+
+def test_many_may_ask_in_the_same_instant(
+    own_bus: LinkConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than a queue of the bus holds by itself: as many as the service says may wait."""
+    waiting, held = 40, threading.Event()
+    answer = node.SimulationService.simulate
+
+    def slow(self: Any, *arguments: Any) -> None:
+        held.wait(PATIENCE_S)
+        answer(self, *arguments)
+
+    monkeypatch.setattr(node.SimulationService, "simulate", slow)
+    ends: list[str] = []
+
+    def ask(client: Client, number: int) -> None:
+        try:
+            reply = client.simulate(fakes.request(f"{number}", steps=1), timeout_s=PATIENCE_S)
+            ends.append(reply.outcome.name)
+        except PalpateError as error:
+            ends.append(str(error))
+
+    with thread(own_bus, "one", waiting=waiting), Client(own_bus.connect[0], timeout_s=20) as robot:
+        until(lambda: any(one.instance == "one" and one.ready for one in robot.alive()))
+        threads = [threading.Thread(target=ask, args=(robot, k)) for k in range(waiting)]
+        for each in threads:
+            each.start()
+        time.sleep(2.0)
+        assert ends == [], "none is refused"
+        held.set()
+        for each in threads:
+            each.join(PATIENCE_S)
+    assert ends == ["COMPLETE"] * waiting

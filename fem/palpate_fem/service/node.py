@@ -387,7 +387,7 @@ def run(
         with (
             SimulationService(session, config, default, health, device) as service,
             HealthReporter(session, health, refresh=service.refresh_health),
-            _Doors(session, claims, service, config.sensor, instance) as doors,
+            _Doors(session, claims, service, config, instance) as doors,
         ):
             session.watch_callers(service.caller_gone)
             session.queryable(endpoints.CANCEL_SIMULATION, service.cancel, sensor=config.sensor)
@@ -422,11 +422,14 @@ class _Doors(Closing):
         session: Session,
         claims: SensorClaims,
         service: SimulationService,
-        sensor: str,
+        config: FemConfig,
         instance: str,
     ) -> None:
         self._session, self._claims, self._service = session, claims, service
-        self._sensor, self._instance = sensor, instance
+        self._sensor, self._instance = config.sensor, instance
+        # The pool refuses what is too much, and says when to ask again; the door must not be
+        # narrower, for many robots may ask in the same instant.
+        self._capacity = max(16, config.waiting + config.slots)
         self._open: list[Queryable] = []
 
     def check(self) -> ClaimedElsewhere | None:
@@ -435,9 +438,15 @@ class _Doors(Closing):
         if holds and not self._open:
             simulate, name = self._service.simulate, self._instance
             self._open = [
-                self._session.stream_queryable(endpoints.SIMULATE, simulate, sensor=self._sensor),
                 self._session.stream_queryable(
-                    endpoints.SIMULATE_AT, simulate, service=SERVICE, instance=name
+                    endpoints.SIMULATE, simulate, sensor=self._sensor, capacity=self._capacity
+                ),
+                self._session.stream_queryable(
+                    endpoints.SIMULATE_AT,
+                    simulate,
+                    service=SERVICE,
+                    instance=name,
+                    capacity=self._capacity,
                 ),
             ]
         elif not holds:
