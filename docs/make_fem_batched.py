@@ -3,6 +3,7 @@
     python tests/benchmarks/bench_batched.py ... --out slots.json
     python tests/benchmarks/bench_batched.py --edge-mm ... --out meshes.json
     python tests/benchmarks/bench_batched_factor.py ... --out factor.json
+    python tests/benchmarks/bench_served.py ... --out served.json
     python docs/make_fem_batched.py
 
 These files are in docs/results/fem-batched. ``sweeps.json`` beside them holds what ``palpate fem
@@ -152,6 +153,23 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
     finish(figure, path, "Time of a trajectory with all slots taken", "Dashed: the goal.")
 
 
+def served(report: dict[str, Any]) -> str:
+    """Callers of the service, beside the same presses without it."""
+    rows = []
+    for run, bare in zip(report["served"], report["bare"], strict=True):
+        ratio = run["ms_a_trajectory"] / bare["ms_a_trajectory"]
+        rows.append(
+            [
+                str(run["callers"]), str(run["presses"]), f"{run['ms_a_trajectory']:.0f}",
+                f"{bare['ms_a_trajectory']:.0f}", f"{ratio:.2f}", f"{run['first_step_s']:.2f}",
+                f"{run['whole_s']:.1f}", f"{run['longest_s']:.1f}", outcomes(run),
+            ]
+        )  # fmt: skip
+    head = ["callers", "presses", "ms a trajectory", "bare", "ratio", "first step [s]",
+            "answer, median [s]", "longest [s]", "answers"]  # fmt: skip
+    return markdown_table(head, rows)
+
+
 def main() -> None:
     """Write page and pictures."""
     report, meshes = read("slots.json"), read("meshes.json")
@@ -177,6 +195,13 @@ def main() -> None:
                 for run in sweeps["runs"]
             ],
         ),
+    ]
+    asked = read("served.json")
+    sections += [
+        f"\n## Served\n\n{asked['device']}, `palpate fem serve --device cuda:0 --slots"
+        f" {asked['slots']}` behind a router, each caller with one request after the other:"
+        f" `{asked['command']}`. *Bare*: the same presses in one process, nothing between.\n",
+        served(asked),
     ]
     PAGE.write_text("\n".join(sections) + "\n", encoding="utf-8")
 
