@@ -7,8 +7,8 @@ r"""Write docs/results/calibrate.md, .json and .png: what `palpate calibrate` le
 
 Simulated specimens learn from so many of their presses and are tested on all others; real fingers
 from their first seconds, tested on the rest, with the other real finger and without. Beside each
-error the one on presses held out, by
-which the estimator is chosen. Numbers only are written, no rows.
+error the one on presses held out, by which the estimator is chosen. Numbers only are written, no
+rows.
 """
 
 from __future__ import annotations
@@ -363,8 +363,8 @@ errors are below [N] / median angle [rad], on all that comes after the first sec
 *Its presses*: the estimator that is chosen above. *Always the mean* of its presses. On finger 1
 presses held out would choose its own alone: they are neighbours of those that were learned from,
 and baselines wander for longer than a minute. So other fingers count wherever the finger is like
-them. They alone, without a press of it, must be off by {LIKE_OTHERS} of 0.5 N and the force at
-most, in the median. It is {min(like):.2f} to {max(like):.2f} from one LASA finger to the other,
+them. Without a press of it, their median error over the force plus 0.5 N must be {LIKE_OTHERS}
+at most. It is {min(like):.2f} to {max(like):.2f} from one LASA finger to the other,
 {facts["foreign"]["real"]:.2f} and more from simulated specimens to these, and
 {facts["foreign"]["simulated"]:.2f} and more from these to simulated specimens.
 {PRESSES_OF_OTHERS} presses of its own count as much as all others. These two numbers were chosen

@@ -18,10 +18,12 @@ from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig
 from palpate.files.bundle import read_bundle
 from palpate.messages import QualityFlag
+from palpate_deploy.station import calibrate
 from palpate_deploy.station.guided_presses import HELD_S, PressCounter
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import write_dataset
+from palpate_training.tasks import finger
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -59,6 +61,10 @@ def count(*readings: tuple[float, float]) -> tuple[int, float]:
     for now_s, force_n in readings:
         counter.take(now_s, force_n)
     return counter.count, counter.largest_n
+
+
+def test_the_command_wants_as_many_presses_as_the_training() -> None:
+    assert calibrate.PRESSES_LEAST == finger.PRESSES_LEAST
 
 
 class TestPresses:
