@@ -21,7 +21,7 @@ import numpy as np
 from rich.console import Console
 
 from palpate.files.atomic import written_whole
-from palpate_training.cli.report import read_folder
+from palpate_training.cli.report import read_source
 from palpate_training.evaluation.cells import (
     Cell,
     CellResult,
@@ -162,7 +162,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
-    source = read_folder(options.data)
+    source = read_source(options.data)
     assert isinstance(source, ExperimentSource)
     curve = Curve(source)
     tasks = list(curve.tasks.values())

@@ -7,12 +7,20 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from palpate.errors import DatasetError
+from palpate.errors import ConfigError, DatasetError
 from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset
+from palpate_training.datasets.join import join_experiments
 from palpate_training.datasets.trials import TrialRows
-from palpate_training.learning.splits import SPLITS, Fold, SplitName, folds_of
+from palpate_training.learning.splits import (
+    PART_SPLITS,
+    SPLITS,
+    Fold,
+    SplitName,
+    folds_of,
+    folds_of_part,
+)
 
 UNITS = ("one", "two", "three")
 INDENTERS = ("cube", "ring", "sphere")
@@ -110,3 +118,53 @@ def test_one_unit_cannot_be_unseen(
     for split in ("unit", "indenter"):
         with pytest.raises(DatasetError, match=f"cannot be split by {split}"):
             folds_of(data, split)
+
+
+@pytest.fixture
+def more(make_rows: Callable[..., TrialRows], provenance: Provenance) -> ExperimentDataset:
+    """Other presses of two of the units."""
+    trials = [make_rows(unit, f"random/{n}") for unit in UNITS[:2] for n in range(7)]
+    return assemble_experiment(trials, provenance, unit_names=UNITS[:2])
+
+
+@pytest.mark.parametrize("split", PART_SPLITS)
+def test_other_parts_are_learned_from_and_never_tested(
+    data: ExperimentDataset, more: ExperimentDataset, split: SplitName
+) -> None:
+    joined = join_experiments([data, more], ["twin", "more"], data.provenance)
+    alone, within = folds_of(data, split), folds_of_part(joined, "twin", split)
+    assert [fold.test for fold in within] == [fold.test for fold in alone]
+    for before, now in zip(alone, within, strict=True):
+        # The part comes first, so its rows have the numbers that they have alone.
+        for side in ("validation", "test"):
+            assert np.array_equal(getattr(now.rows, side), getattr(before.rows, side))
+        added = now.rows.train[len(before.rows.train) :]
+        assert np.array_equal(now.rows.train[: len(before.rows.train)], before.rows.train)
+        assert units(joined, added) == units(data, before.rows.train) & set(UNITS[:2])
+        assert all(name.startswith("more/") for name in names(joined, added))
+    together = next(fold for fold in within if fold.test in ("all units", "two + three to one"))
+    count = len(more) if split != "unit" else int((more.row_unit == 1).sum())
+    assert int((together.rows.train >= len(data)).sum()) == count
+
+
+def test_the_part_may_stand_anywhere(data: ExperimentDataset, more: ExperimentDataset) -> None:
+    joined = join_experiments([more, data], ["more", "twin"], data.provenance)
+    alone = folds_of(data, "trajectory")[0].rows.test
+    assert np.array_equal(
+        folds_of_part(joined, "twin", "trajectory")[0].rows.test, alone + len(more)
+    )
+
+
+def test_a_part_has_to_be_one_of_several_with_presses_of_its_own(
+    data: ExperimentDataset, more: ExperimentDataset
+) -> None:
+    joined = join_experiments([data, more], ["twin", "more"], data.provenance)
+    with pytest.raises(ConfigError, match=r"tw is no part .* more, twin"):
+        folds_of_part(joined, "tw", "trajectory")
+    with pytest.raises(ConfigError, match="twin is no part"):
+        folds_of_part(join_experiments([data], ["twin"], data.provenance), "twin", "trajectory")
+    again = join_experiments([data, more, data], ["twin", "more", "copy"], data.provenance)
+    with pytest.raises(
+        ConfigError, match=f"{len(data)} of {len(data)} rows of twin are in another"
+    ):
+        folds_of_part(again, "twin", "trajectory")

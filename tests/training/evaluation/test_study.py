@@ -19,11 +19,17 @@ from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
 from palpate_training.cli import train_app
-from palpate_training.cli.report import read_folder, train_report
+from palpate_training.cli.report import read_source, train_report
 from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.container import Provenance
-from palpate_training.datasets.experiment import ExperimentDataset, write_experiment
+from palpate_training.datasets.experiment import (
+    ExperimentDataset,
+    MixedDataset,
+    write_experiment,
+    write_mixed,
+)
 from palpate_training.datasets.export import export_published
+from palpate_training.datasets.join import join_experiments
 from palpate_training.datasets.trials import TrialRows
 from palpate_training.evaluation.experiments import ExperimentSource
 from palpate_training.evaluation.features import paper_weights, weighted_median
@@ -178,12 +184,52 @@ def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_pat
     with pytest.raises(ConfigError, match="no split sideways"):
         train_report(**{**options, "splits": "sideways"})
     with pytest.raises(DatasetError, match="neither experiment"):
-        read_folder(tmp_path / "out")
+        read_source(tmp_path / "out")
     words = ["report", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--so-far"]
     words += ["--tasks", "force", "--splits", "trajectory", "--systems", "zero, ridge", "--whole"]
     done = CliRunner().invoke(train_app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     assert [path.stat().st_mtime_ns for path in kept] == times
+
+
+def test_other_parts_of_a_joined_data_set_are_learned_from_alone(
+    data: ExperimentDataset,
+    mixed: MixedDataset,
+    make_rows: Callable[..., TrialRows],
+    provenance: Provenance,
+    tmp_path: Path,
+) -> None:
+    """The command on a file: the same rows are tested as without the other part."""
+    more = [make_rows(unit, f"ring/{n}") for unit in data.unit_names for n in range(4)]
+    joined = join_experiments(
+        [data, assemble_experiment(more, provenance)], ["twin", "more"], provenance
+    )
+    write_experiment(tmp_path / "experiment.h5", joined)
+    options: dict[str, Any] = {
+        "data": tmp_path, "out": tmp_path / "out", "tasks": "force", "systems": "training mean",
+        "seeds": 1, "whole": True, "workers": 1, "device": "cpu", "cells": None, "so_far": False,
+        "test_part": "twin",
+    }  # fmt: skip
+    train_report(**options)
+    values = json.loads((tmp_path / "out" / "study.json").read_text())
+    assert {row["split"] for row in values["scores"]} == {"trajectory", "execution", "unit"}
+    said = {name: count for name, count in values["rows"].items() if "tested" in name}
+    assert said == {"rows of twin, of which alone some are tested": len(data)}
+    alone = Study(ExperimentSource(data, None), StudyPlan(tasks=("force",)))
+    part = Study(ExperimentSource(joined, None, "twin"), StudyPlan(tasks=("force",)))
+    tested = [
+        {(cell.fold.test, *cell.fold.rows.test) for cell in one.cells
+         if cell.fold.split == "trajectory"}
+        for one in (alone, part)
+    ]  # fmt: skip
+    assert tested[0] == tested[1]
+    with pytest.raises(ConfigError, match="no split point"):
+        train_report(**options, splits="point, trajectory")
+    with pytest.raises(ConfigError, match="third is no part"):
+        train_report(**{**options, "test_part": "third"})
+    write_mixed(tmp_path / "mixed-alone.h5", mixed)
+    with pytest.raises(ConfigError, match="twin is no part"):
+        train_report(**{**options, "data": tmp_path / "mixed-alone.h5"})
 
 
 def test_the_published_layout_goes_through_the_same_command(

@@ -42,7 +42,7 @@ def train_report(
         Path,
         typer.Option(
             help="Folder with experiment.h5 and mixed.h5, with the published files, or with "
-            "lasa_force_calibration and lasa_contact_normal."
+            "lasa_force_calibration and lasa_contact_normal; or a mixed or joined data set (.h5)."
         ),
     ],
     out: Annotated[
@@ -50,6 +50,13 @@ def train_report(
     ],
     tasks: Annotated[str, typer.Option(help="Tasks, with commas between; empty = all.")] = "",
     splits: Annotated[str, typer.Option(help="Splits, with commas between; empty = all.")] = "",
+    test_part: Annotated[
+        str,
+        typer.Option(
+            help="Of a joined data set: the part whose presses alone are tested; all others are "
+            "learned from. Splits: trajectory, execution, unit."
+        ),
+    ] = "",
     systems: Annotated[
         str, typer.Option(help="Words of which a system's name has one; empty = all.")
     ] = "",
@@ -76,17 +83,26 @@ def train_report(
     palpate train report --data runs/twin --out runs/report
 
     palpate train report --data runs/twin --out runs/quick --tasks force --splits trajectory --whole
+
+    palpate train report --data joined.h5 --test-part twin --out runs/more --splits trajectory
     """
     from palpate_training.evaluation.experiments import TASKS
     from palpate_training.evaluation.page import write_pages
     from palpate_training.evaluation.study import Study, StudyPlan, write_study
-    from palpate_training.learning.splits import SPLITS
+    from palpate_training.learning.splits import PART_SPLITS, SPLITS
 
     wanted = _words(splits)
     unknown = [word for word in wanted if word not in SPLITS]
     if unknown:
         raise ConfigError(
             f"there is no split {', '.join(unknown)}", remedy=f"one of: {', '.join(SPLITS)}"
+        )
+    beyond = [word for word in wanted if test_part and word not in PART_SPLITS]
+    if beyond:
+        raise ConfigError(
+            f"--test-part has no split {', '.join(beyond)}: what is held out of one part may have"
+            " been met in another",
+            remedy=f"of {', '.join(PART_SPLITS)}, or without --test-part",
         )
     plan = StudyPlan(
         tasks=_words(tasks) or TASKS,
@@ -95,7 +111,7 @@ def train_report(
         seeds=tuple(range(seeds)),
         whole=whole,
     )
-    study = Study(read_folder(data), plan)
+    study = Study(read_source(data, test_part), plan)
     folder = cells or out / "cells"
     if not so_far:
         make_with_progress(study, folder, workers or os.cpu_count() or 1, device)
@@ -204,10 +220,15 @@ def make_with_progress(study: Study, folder: Path, workers: int, device: str) ->
         study.make(folder, workers=workers, device=device, on_cell=on_cell)
 
 
-def read_folder(folder: Path) -> StudySource:
-    """The data of a folder: an experiment, generated, executed or published; or real recordings.
+def read_source(path: Path, part: str = "") -> StudySource:
+    """Data of a study: an experiment, generated, executed or published; or real recordings.
+
+    Args:
+        path: Folder of the data, or a mixed data set.
+        part: Of a joined data set, whose rows alone are tested.
 
     Raises:
+        ConfigError: Recordings, which have no parts.
         DatasetError: There is none, or it is damaged.
     """
     from palpate_training.datasets.experiment import read_experiment, read_mixed
@@ -215,19 +236,28 @@ def read_folder(folder: Path) -> StudySource:
     from palpate_training.evaluation.experiments import ExperimentSource
     from palpate_training.evaluation.recordings import read_recordings
 
-    if (folder / "experiment.h5").is_file():
-        mixed = folder / "mixed.h5"
+    if path.is_file():
+        whole = read_mixed(path)
+        return ExperimentSource(whole.experiment, whole, part)
+    if (path / "experiment.h5").is_file():
+        mixed = path / "mixed.h5"
         return ExperimentSource(
-            read_experiment(folder / "experiment.h5"),
+            read_experiment(path / "experiment.h5"),
             read_mixed(mixed) if mixed.is_file() else None,
+            part,
         )
-    if any(published_file(folder, unit).is_file() for unit in (1, 2, 3)):
-        return ExperimentSource(read_published(folder, command=typed_command()), None)
-    recordings = read_recordings(folder)
-    if recordings is not None:
-        return recordings
-    raise DatasetError(
-        f"{folder} holds neither experiment.h5 nor biotac1.hdf5, nor real recordings",
-        remedy="generate a data set (palpate data generate), or name the folder of the published "
-        "files, or one with lasa_force_calibration or lasa_contact_normal",
-    )
+    if any(published_file(path, unit).is_file() for unit in (1, 2, 3)):
+        return ExperimentSource(read_published(path, command=typed_command()), None, part)
+    recordings = read_recordings(path)
+    if recordings is None:
+        raise DatasetError(
+            f"{path} holds neither experiment.h5 nor biotac1.hdf5, nor real recordings",
+            remedy="generate a data set (palpate data generate), or name the folder of the"
+            " published files, or one with lasa_force_calibration or lasa_contact_normal",
+        )
+    if part:
+        raise ConfigError(
+            f"{path} holds recordings, which have no parts",
+            remedy="leave --test-part out, or name a joined data set (palpate data join)",
+        )
+    return recordings

@@ -20,7 +20,15 @@ from palpate_training.evaluation.cells import Task
 from palpate_training.evaluation.features import FeatureTask, force_shares, systems_of
 from palpate_training.evaluation.pictures import Made, Picture, draw_forces, draw_task
 from palpate_training.evaluation.skin import FieldTask, SynthesisTask, of_one_unit
-from palpate_training.learning.splits import ALL_UNITS, Fold, SplitName, folds_of
+from palpate_training.learning.splits import (
+    ALL_UNITS,
+    PART_SPLITS,
+    Fold,
+    SplitName,
+    folds_of,
+    folds_of_part,
+    rows_of_part,
+)
 from palpate_training.systems.samples import Quantity, samples_of
 
 TASKS = (*get_args(Quantity), "field", "synthesis")
@@ -46,10 +54,13 @@ class ExperimentSource:
     Attributes:
         experiment: For location and force.
         mixed: For the other tasks; None leaves them out.
+        part: Part of joined data sets whose rows alone are tested; all the others' are learned
+            from. Empty: the rows of all parts are dealt to the sides.
     """
 
     experiment: ExperimentDataset
     mixed: MixedDataset | None
+    part: str = ""
 
     def task(self, name: str) -> Task | None:
         """A task by name; None if the data does not hold it."""
@@ -79,11 +90,16 @@ class ExperimentSource:
 
     def splits(self, task: str) -> tuple[SplitName, ...]:
         """Splits of a task; the first is trained with several seeds."""
-        return TASK_SPLITS[task]
+        splits = TASK_SPLITS[task]
+        return tuple(one for one in splits if one in PART_SPLITS) if self.part else splits
 
     def folds(self, task: str, split: SplitName, *, seed: int, whole: bool) -> list[Fold]:
         """Trainings of a split; ``whole``: only those of all units together, in every split."""
-        folds = folds_of(self._rows(task), split, seed=seed)
+        rows = self._rows(task)
+        if self.part:
+            folds = folds_of_part(rows, self.part, split, seed=seed)
+        else:
+            folds = folds_of(rows, split, seed=seed)
         if task == "synthesis":
             assert self.mixed is not None
             return of_one_unit(folds, self.mixed)
@@ -105,13 +121,21 @@ class ExperimentSource:
     @property
     def row_counts(self) -> dict[str, int]:
         """Rows of each data set."""
-        mixed = {} if self.mixed is None else {"mixed rows with fields": len(self.mixed)}
-        return {"rows of the experiment": len(self.experiment), **mixed}
+        counts = {"rows of the experiment": len(self.experiment)}
+        if self.mixed is not None:
+            counts["mixed rows with fields"] = len(self.mixed)
+        if self.part:
+            tested = rows_of_part(self.experiment, self.part)
+            counts[f"rows of {self.part}, of which alone some are tested"] = int(tested.sum())
+        return counts
 
     @property
     def _force_n(self) -> npt.NDArray[np.float64]:
-        """Magnitude of the force of each row [N]."""
-        return np.asarray(np.linalg.norm(self.experiment.force.astype(np.float64), axis=1))
+        """Magnitude of the force of each row of the experiment, or of its part [N]."""
+        force = self.experiment.force.astype(np.float64)
+        if self.part:
+            force = force[rows_of_part(self.experiment, self.part)]
+        return np.asarray(np.linalg.norm(force, axis=1))
 
     @property
     def forces(self) -> dict[str, float]:

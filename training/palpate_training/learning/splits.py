@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from palpate.errors import DatasetError
+from palpate.errors import ConfigError, DatasetError
+from palpate_training.datasets.basis import subset
 from palpate_training.datasets.experiment import ExperimentDataset
 
 Rows = npt.NDArray[np.int64]
@@ -276,6 +277,76 @@ def folds_of(data: ExperimentDataset, split: SplitName, *, seed: int = 0) -> lis
             remedy="it needs two units, or two indenters on a unit",
         )
     return folds
+
+
+def rows_of_part(data: ExperimentDataset, part: str) -> Mask:
+    """Which rows of a joined data set are of a part, shape (N,).
+
+    Raises:
+        ConfigError: There is no such part, or it is the only one.
+    """
+    of = np.array([name.partition("/")[0] for name in data.trajectories])
+    found = of == part
+    if not found.any() or found.all():
+        raise ConfigError(
+            f"{part} is no part of a joined data set: its trajectories' names begin with"
+            f" {', '.join(np.unique(of)[:9])}",
+            remedy="join data sets (palpate data join), and name one by its file without .h5",
+        )
+    return np.asarray(found[data.row_trajectory])
+
+
+PART_SPLITS: tuple[SplitName, ...] = ("trajectory", "execution", "unit")
+"""Splits of a part of a joined data set: points and indenters that are held out in one part may
+have been met in another."""
+
+
+def folds_of_part(
+    data: ExperimentDataset, part: str, split: SplitName, *, seed: int = 0
+) -> list[Fold]:
+    """Trainings of one part of a joined data set, whose other parts are learned from, too.
+
+    The part's rows are dealt as if it were alone. All rows of the other parts join the training
+    rows, as far as they are of the same units.
+
+    Args:
+        data: Joined data sets; names of trajectories begin with the part's.
+        part: Its name.
+        split: One of ``PART_SPLITS``.
+        seed: Deals the part's trajectories to the sides.
+
+    Raises:
+        ConfigError: As in ``rows_of_part``, or rows of the part are in another one, too.
+        DatasetError: As in ``folds_of``.
+    """
+    assert split in PART_SPLITS
+    of_part = rows_of_part(data, part)
+    mine, others = np.flatnonzero(of_part), np.flatnonzero(~of_part)
+    twice = int(np.isin(_as_bytes(data.tared[mine]), _as_bytes(data.tared[others])).sum())
+    if twice:
+        raise ConfigError(
+            f"{twice} of {len(mine)} rows of {part} are in another part, too: they would be"
+            " learned from and tested",
+            remedy="join data sets of different presses",
+        )
+    alone = subset(data, np.unique(data.trial[mine]).tolist())
+    folds = []
+    for fold in folds_of(alone, split, seed=seed):
+        sides = {
+            side: mine[getattr(fold.rows, side)]
+            for side in ("train", "validation", "test", "guard")
+        }
+        units = np.unique(data.row_unit[sides["train"]])
+        more = others[np.isin(data.row_unit[others], units)]
+        sides["train"] = np.concatenate([sides["train"], more])
+        folds.append(replace(fold, rows=RowSplit(**sides)))
+    return folds
+
+
+def _as_bytes(rows: npt.NDArray[np.float32]) -> npt.NDArray[np.void]:
+    """Each row as one value, to be looked for among others."""
+    rows = np.ascontiguousarray(rows)
+    return rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1])))[:, 0]
 
 
 def _folds(data: ExperimentDataset, split: SplitName, seed: int) -> Iterator[Fold]:
