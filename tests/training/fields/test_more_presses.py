@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,3 +62,10 @@ def test_two_experiments_make_bundles_that_are_tested_on_a_third(
     said = run(train_app, "synthesis", both, tmp_path / "synthesis", *named, *quick)
     assert "synthesis-twin 1, biotac-2" in said
     run(train_app, "evaluate", tmp_path / "synthesis", held, "--unit", "biotac-2")
+
+    study = ["--data", str(both), "--out", str(tmp_path / "study"), "--workers", "1"]
+    study += ["--splits", "trajectory", "--whole", "--device", "cpu", "--systems", "training mean"]
+    run(train_app, "report", *study, "--test-part", "first")
+    values = json.loads((tmp_path / "study" / "study.json").read_text(encoding="utf-8"))
+    assert {row["task"] for row in values["scores"]} >= {"force", "field", "synthesis"}
+    assert values["rows"]["rows of first, of which alone some are tested"] > 0

@@ -120,8 +120,11 @@ class ExperimentSource:
 
     @property
     def row_counts(self) -> dict[str, int]:
-        """Rows of each data set."""
-        counts = {"rows of the experiment": len(self.experiment)}
+        """Rows of each data set, and trajectories."""
+        counts = {
+            "trajectories": len(self.experiment.trajectories),
+            "rows of the experiment": len(self.experiment),
+        }
         if self.mixed is not None:
             counts["mixed rows with fields"] = len(self.mixed)
         if self.part:
