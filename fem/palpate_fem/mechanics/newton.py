@@ -102,8 +102,7 @@ class NewtonSolver:
                     answer = self._factorise(wanted)
                 else:
                     if isinstance(wanted, Correct):
-                        system.correct_contact(state, indenter)
-                        balance = system.balance(state, indenter)
+                        balance = system.corrected_balance(state, indenter)
                     else:
                         balance = self._step(state, indenter, balance, volume, wanted.damping)
                     answer = balance, system.sets_changed

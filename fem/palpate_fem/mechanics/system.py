@@ -205,6 +205,22 @@ class EquilibriumSystem:
         self._both(first_half, second_half)
         return self._sum_up(state)
 
+    def corrected_balance(
+        self, state: SolutionState, indenter: PosedIndenter | None
+    ) -> ForceBalance:
+        """Evaluate the mortar corrections of the last `balance`'s state, and its balance with them.
+
+        Skin and fluid are as they were, so contact alone is evaluated.
+        """
+        assert self._at is not None
+        position, _, _ = self._at
+        self.correct_contact(state, indenter)
+        self._both(
+            lambda: self.on_indenter.evaluate(state, indenter, position),
+            lambda: self.on_core.evaluate(state, position),
+        )
+        return self._sum_up(state)
+
     def correct_contact(self, state: SolutionState, indenter: PosedIndenter | None) -> None:
         """Evaluate the mortar corrections of a state and keep them in it."""
         state.on_indenter = self.on_indenter.correction(state, indenter)
