@@ -245,7 +245,7 @@ def pool_of(kind: float, **more: Any) -> Iterator[DevicePool]:
     setup = WorkerSetup(
         "fem_fakes:make", options, FingertipParameters(friction_coefficient=kind), 1
     )
-    cpu = WorkerPool(setup, workers=1, threads=1, waiting=4, grace_s=0.3)
+    cpu = WorkerPool(setup, workers=1, threads=1, waiting=more.pop("cpu_waiting", 4), grace_s=0.3)
     given = {"slots": 2, "waiting": 4, "grace_s": 0.3, **more}
     with DevicePool(setup, "cpu", cpu, **given) as pool:
         yield pool
@@ -305,6 +305,50 @@ def test_a_device_that_hangs_is_replaced() -> None:
         await_ready(pool)
         assert pool.pid != stopped
         assert not pool.trouble
+
+
+def test_what_waits_for_a_worker_goes_back_to_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its process is killed with two jobs on it; jobs of another finger stay with the worker."""
+    monkeypatch.setattr(device_pool, "PAUSE_S", 0.1)
+    with pool_of(fakes.SLOW, waiting=20, cpu_waiting=20) as pool:
+        await_ready(pool)
+        asked = [submit(pool, f"{k}", fakes.SLOW, steps=30) for k in range(6)]
+        assert isinstance(asked[0].get(timeout=PATIENCE_S), JobStarted)
+        assert isinstance(asked[0].get(timeout=PATIENCE_S), StepConverged)
+        assert pool.pid is not None
+        os.kill(pool.pid, signal.SIGKILL)
+        until(lambda: pool.restarts == 1)
+        other = submit(pool, "other", fakes.QUICK)
+        away = submit(pool, "away", fakes.SLOW, steps=30)
+        for k, events in enumerate([*asked, away]):
+            end, steps = ended(events)
+            assert isinstance(end, JobEnded), end
+            assert (end.outcome, steps + (k == 0)) == (IndentationOutcome.COMPLETE, 30)
+        assert isinstance(ended(other)[0], JobEnded)
+        assert pool.redone == 1, "one ran on the worker, all others came back"
+        assert pool.waiting == pool.busy == 0
+
+
+def test_a_job_that_ends_devices_is_left_to_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It goes back once; the worker that it ends, too, costs its owner an error, and no other."""
+    monkeypatch.setattr(device_pool, "PAUSE_S", 0.1)
+    with pool_of(fakes.DIES, waiting=20) as pool:
+        await_ready(pool)
+        slow = submit(pool, "slow", fakes.SLOW, steps=199)  # keeps the worker
+        until(lambda: pool.busy == 1)
+        poison = submit(pool, "poison", fakes.DIES)
+        until(lambda: pool.restarts == 2)
+        await_ready(pool)
+        time.sleep(0.5)
+        assert pool.restarts == 2
+        harmless = submit(pool, "harmless", fakes.DIES, steps=2)
+        assert isinstance(ended(harmless)[0], JobEnded)
+        assert pool.cancel("slow")
+        assert isinstance(ended(slow)[0], JobEnded)
+        failed, steps = ended(poison)
+        assert isinstance(failed, JobFailed)
+        assert (failed.code, steps) == (ErrorCode.INTERNAL, 2)
+        assert pool.restarts == 2
 
 
 def test_nobody_waits_for_a_device_that_does_not_stop() -> None:

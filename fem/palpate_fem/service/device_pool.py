@@ -1,8 +1,9 @@
 """A device in front of a pool of workers: requests for one fingertip are solved there together.
 
 Whatever the device does not solve, and whatever it had when its process died or hung, the workers
-solve from the first step on. Its owner gets one answer: steps that it has are not sent again, and
-if the workers find other forces for them, the answer is an error.
+solve from the first step on; what still waits for a worker when the device is back goes back to it.
+The owner of a job gets one answer: steps that it has are not sent again, and if other forces are
+found for them, the answer is an error.
 """
 
 from __future__ import annotations
@@ -60,6 +61,10 @@ PAUSE_S = 1.0
 """Time after which a device's process is started again [s]; doubled each time until one solves a
 trajectory."""
 
+LOSSES_MOST = 2
+"""Processes of a device that end with a job on them; then workers solve it: it may be what ends
+them."""
+
 _LONGEST_PAUSE_S = 300.0
 _LEAST_FORCE_N = 0.01
 _TICK_S = 0.05
@@ -79,8 +84,10 @@ class DeviceTask:
         overdue: When its owner gets an answer in any case, while a device has it [s, monotonic].
         before: Number of jobs before it, as its owner was told.
         started: Whether its owner was told that it has started.
-        forces: Of the steps that the device has made [N], each of shape (3,).
-        redone: Steps that workers have made since.
+        forces: Of the steps that its owner has [N], each of shape (3,).
+        made: Steps that whoever has it now has made.
+        losses: Processes of the device that have ended with it.
+        workers_only: Whether it does not go back to the device.
         cancelled: Whether it is to be stopped.
         over: Whether its owner has had the last event.
     """
@@ -93,7 +100,9 @@ class DeviceTask:
     before: int = -1
     started: bool = False
     forces: list[Floats] = field(default_factory=list)
-    redone: int = 0
+    made: int = 0
+    losses: int = 0
+    workers_only: bool = False
     cancelled: bool = False
     over: bool = False
 
@@ -102,7 +111,8 @@ class DevicePool(Closing):
     """Runs jobs on a device, and with workers; used like a `WorkerPool`.
 
     Jobs whose parameters are those of the warm fingertip go to the device while it is ready, all
-    others to the workers. Its process is started again whenever it has ended. All events of a
+    others to the workers. Its process is started again whenever it has ended, and gets what still
+    waits for a worker then. All events of a
     device are handled by one thread; workers' threads come in with those of jobs that are redone.
     Shared state is changed under one lock, and callbacks to owners run outside of it.
 
@@ -121,7 +131,7 @@ class DevicePool(Closing):
 
     Attributes:
         restarts: Times that its process has ended.
-        redone: Jobs that it did not solve and workers had to.
+        redone: Jobs that were the device's and that workers have, or had, to solve.
         trouble: Why the device does not serve; empty = it does, or is started for the first time.
     """
 
@@ -342,11 +352,12 @@ class DevicePool(Closing):
                 started.append(task)
             waiting = list(self._waiting)
         for task in started:
-            task.started = True
             assert self._fingertip is not None
-            self._report(task, JobStarted(self._fingertip))
+            if not task.started:
+                task.started = True
+                self._report(task, JobStarted(self._fingertip))
         for before, task in enumerate(waiting):
-            if before != task.before:
+            if before != task.before and not task.started:
                 task.before = before
                 self._report(task, JobWaiting(before))
 
@@ -354,8 +365,9 @@ class DevicePool(Closing):
         match event:
             case PressStep(number, step):
                 task = process.open[number]
-                task.forces.append(step.force)
-                self._report(task, StepConverged(step))
+                if (apart_n := self._passed_on(task, step)) is not None:
+                    process.send(StopPress(number))
+                    self._finish(task, self._cannot_continue(task, apart_n))
             case PressEnded(number, result):
                 process.send(ResultTaken())
                 self._pause_s = PAUSE_S
@@ -364,7 +376,9 @@ class DevicePool(Closing):
             case PressRefused(number, failed):
                 self._finish(self._taken(process, number), failed)
             case PressUnsolved(number):
-                self._redo(self._taken(process, number))
+                task = self._taken(process, number)
+                task.workers_only = True
+                self._redo(task)
             case JobStarted(fingertip):
                 self._fingertip = fingertip
                 # Before it counts as ready: whoever sees it ready relies on the fingertip.
@@ -372,6 +386,7 @@ class DevicePool(Closing):
             case DeviceReady():
                 process.ready, self.trouble = True, ""
                 _log.info("%s", self.serves)
+                self._take_back()
             case JobFailed():
                 process.last_words = event
             case None:
@@ -392,12 +407,33 @@ class DevicePool(Closing):
             self._process = None
             self.restarts += 1
             self._start_later(process.why_it_ended())
+            for task in process.open.values():
+                task.losses += 1
+                task.workers_only = task.losses >= LOSSES_MOST
             left = [*process.open.values(), *self._waiting]
             self._waiting.clear()
             for task in left:
                 task.number, task.overdue = -1, math.inf
         for task in left:
             self._redo(task)
+
+    def _take_back(self) -> None:
+        """Give the device what still waits for a worker."""
+        warm = self._setup.worker.warm
+
+        def is_mine(job: SimulationJob) -> bool:
+            known = self._tasks.get(job.id)
+            return job.parameters == warm and not (known and known.workers_only)
+
+        with self._lock:
+            for one in self._cpu.take_back(is_mine):
+                task = self._tasks.get(one.job.id)
+                if task is None:  # came while the device was away
+                    task = DeviceTask(one.job, one.on_event, one.deadline)
+                    self._tasks[one.job.id] = task
+                else:
+                    self.redone -= 1
+                self._waiting.append(task)
 
     def _redo(self, task: DeviceTask) -> None:
         """Have workers solve a job from its first step on."""
@@ -407,6 +443,7 @@ class DevicePool(Closing):
             self._finish(task, self._ended(task, JobEnded(IndentationOutcome.CANCELLED)))
             return
         self.redone += 1
+        task.made = 0
         left_s = max(0.0, task.deadline - time.monotonic())
         try:
             self._cpu.submit(
@@ -423,10 +460,7 @@ class DevicePool(Closing):
         """Pass on what a job's owner has not had."""
         match event:
             case StepConverged(step):
-                task.redone += 1
-                if task.redone > len(task.forces):
-                    self._report(task, event)
-                elif (apart_n := self._apart_n(task, step)) is not None:
+                if (apart_n := self._passed_on(task, step)) is not None:
                     # First, as its owner may use the id again when it has the answer.
                     self._cpu.cancel(task.job.id)
                     self._finish(task, self._cannot_continue(task, apart_n))
@@ -438,18 +472,27 @@ class DevicePool(Closing):
                 if not task.started:
                     self._report(task, event)
 
-    @staticmethod
-    def _apart_n(task: DeviceTask, step: IndentationStep) -> float | None:
-        """How far a step's force is from that on the device [N]; None = it is the same."""
+    def _passed_on(self, task: DeviceTask, step: IndentationStep) -> float | None:
+        """Pass on a step that the owner does not have.
+
+        Returns:
+            How far its force is from that of the step that the owner has [N]; None = it is the
+            same, or the step was new.
+        """
+        task.made += 1
+        if task.made > len(task.forces):
+            task.forces.append(step.force)
+            self._report(task, StepConverged(step))
+            return None
         largest = max(_LEAST_FORCE_N, *(float(np.linalg.norm(one)) for one in task.forces))
-        apart = float(np.linalg.norm(step.force - task.forces[task.redone - 1]))
+        apart = float(np.linalg.norm(step.force - task.forces[task.made - 1]))
         return None if apart <= SAME * largest else apart
 
     def _cannot_continue(self, task: DeviceTask, apart_n: float) -> JobFailed:
         return JobFailed(
             ErrorCode.SIMULATION,
             f"{self._setup.device} went another way than the CPU, which has to go on: in step "
-            f"{task.redone} their forces are {apart_n:.3f} N apart",
+            f"{task.made} their forces are {apart_n:.3f} N apart",
             "ask again with shorter steps, or serve without --device",
         )
 

@@ -250,6 +250,14 @@ class WorkerPool(Closing):
             worker.cancel(job_id)
         return True
 
+    def take_back(self, wanted: Callable[[SimulationJob], bool]) -> list[PoolTask]:
+        """Jobs that still wait, in order; the pool forgets them, and their owners hear nothing."""
+        with self._lock:
+            taken = [task for task in self._waiting if wanted(task.job)]
+            for task in taken:
+                self._waiting.remove(task)
+        return taken
+
     def close(self) -> None:
         """End every job with UNAVAILABLE, and every worker."""
         with self._lock:
