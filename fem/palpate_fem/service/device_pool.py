@@ -112,9 +112,9 @@ class DevicePool(Closing):
 
     Jobs whose parameters are those of the warm fingertip go to the device while it is ready, all
     others to the workers. Its process is started again whenever it has ended, and gets what still
-    waits for a worker then. All events of a
-    device are handled by one thread; workers' threads come in with those of jobs that are redone.
-    Shared state is changed under one lock, and callbacks to owners run outside of it.
+    waits for a worker then. All events of a device are handled by one thread; workers' threads come
+    in with those of jobs that are redone. Shared state is changed under one lock, and callbacks to
+    owners run outside of it.
 
     Args:
         setup: How the fingertip is made; what makes it is a ``SlottedTip``.

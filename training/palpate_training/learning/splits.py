@@ -290,7 +290,7 @@ def rows_of_part(data: ExperimentDataset, part: str) -> Mask:
     if not found.any() or found.all():
         raise ConfigError(
             f"{part} is no part of a joined data set: its trajectories' names begin with"
-            f" {', '.join(np.unique(of)[:9])}",
+            f" {', '.join(np.unique(of)[:20])}",
             remedy="join data sets (palpate data join), and name one by its file without .h5",
         )
     return np.asarray(found[data.row_trajectory])
