@@ -92,7 +92,8 @@ TAIL = """
 networks are trained on, and none levels off ([picture](study/presses.png),
 `python docs/make_learning_curve.py`). The floors are below nearly all goals, so noise, labels and
 networks would allow them. The last column is what the slope of the last doubling would ask for;
-slopes become flatter, though: the force was {force_more} off with what is above. {hard} of the rows are above 8 N.
+slopes become flatter, though: the force was {force_more} off with the presses above. {hard} of the
+rows are above 8 N.
 
 {curve}
 * **The ratios.** Presses limit the paper's networks, too. On neighbouring rows our error is
