@@ -108,7 +108,7 @@ def main() -> int:
     from tests.chaos.report import report  # what it needs is not there inside
 
     result = report(given.work, given.minutes, given.seed)
-    given.out.parent.mkdir(parents=True, exist_ok=True)  # half an hour is not lost for a folder
+    given.out.parent.mkdir(parents=True, exist_ok=True)  # else half an hour is lost
     given.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     say(f"wrote {given.out}")
     for goal in result["goals"]:
