@@ -162,6 +162,23 @@ def test_no_number_has_changed_where_the_tangent_is_that_of_the_state(batch: Bat
     assert not any(one.sets_changed for one in batch.equations.numbers(batch.state, batch.all))
 
 
+def test_what_has_not_moved_keeps_the_forces_of_its_skin(batch: Batch) -> None:
+    batch.run(batch.all, "moved")
+    equations, state, first = batch.equations, batch.state, PLACES[0]
+    state.put(first, batch.cases[0].second)
+    equations.correct_contact(state, batch.all)
+    equations.balance(state, batch.all, moved=equations.listed(np.array([first])))
+    numbers, forces = equations._numbers.numpy(), equations._unbalanced.numpy()
+    equations.balance(state, batch.all)
+    same(equations._numbers.numpy(), numbers)
+    same(equations._unbalanced.numpy(), forces)
+
+    kept = equations._internal.numpy()
+    state.put(first, batch.cases[0].first)
+    equations.balance(state, batch.all, moved=equations.listed(np.zeros(0, int)))
+    np.testing.assert_array_equal(kept, equations._internal.numpy())
+
+
 def test_mortar_corrections(batch: Batch) -> None:
     batch.run(batch.all, "first")
     equations = batch.equations

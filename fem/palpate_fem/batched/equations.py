@@ -216,12 +216,24 @@ class BatchedEquations:
         )  # fmt: skip
         surface.offset_gaps(listed.inner, self._margin)
 
-    def balance(self, state: BatchedState, listed: Listed) -> None:
-        """Evaluate forces and all that `numbers` tells; see `EquilibriumSystem.balance`."""
-        outer, inner = self.outer, self.inner
-        for field in (self._internal, self._gradient_of_volume, outer.force, inner.force):
+    def balance(self, state: BatchedState, listed: Listed, *, moved: Listed | None = None) -> None:
+        """Evaluate forces and all that `numbers` tells; see `EquilibriumSystem.balance`.
+
+        Args:
+            state: Where.
+            listed: Slots.
+            moved: Those of them that are not where the last balance was; None = all. The others
+                keep the forces of skin and fluid.
+        """
+        self._skin_forces(state, listed if moved is None else moved)
+        self._contact_forces(state, listed)
+        self._reduce(state, listed)
+
+    def _skin_forces(self, state: BatchedState, listed: Listed) -> None:
+        """Evaluate the forces of the skin, and the cavity's volume."""
+        for field in (self._internal, self._gradient_of_volume):
             self._clear(listed, field)
-        corners, points = self._elements.shape[1], self._weight.shape[1]
+        inner, corners, points = self.inner, self._elements.shape[1], self._weight.shape[1]
         self._launch(
             element_kernels.point_stress,
             (len(listed.elements), points),
@@ -241,6 +253,12 @@ class BatchedEquations:
             [inner.faces, self._form, self._nodes, listed.inner, state.position],
             [self._face_volume, self._gradient_of_volume],
         )
+
+    def _contact_forces(self, state: BatchedState, listed: Listed) -> None:
+        """Evaluate the forces of indenter and core."""
+        outer, inner = self.outer, self.inner
+        for field in (outer.force, inner.force):
+            self._clear(listed, field)
         posed = [self._primitives, self._kind]
         place = [self._tip, self._rotation, self._nodes, listed.outer]
         self._launch(
@@ -277,7 +295,6 @@ class BatchedEquations:
                      state.position, state.core_pressure],
                     [inner.mortar_status, inner.mortar_tangent, inner.force],
                 )  # fmt: skip
-        self._reduce(state, listed)
 
     def _reduce(self, state: BatchedState, listed: Listed) -> None:
         """Sums and maxima of the listed slots."""

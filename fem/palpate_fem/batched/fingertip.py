@@ -284,9 +284,9 @@ class BatchedFingertip:
                 listed = self.equations.listed(np.array(begin))
                 self._ratios.assign(ratio)
                 self._trial.extrapolate(self._now, self._before, self._ratios, listed.slots)
-            listed = self.equations.listed(np.array(slots))
+            listed, moved = (self.equations.listed(np.array(some, int)) for some in (slots, begin))
             self.equations.correct_contact(self._trial, listed)
-            self.equations.balance(self._trial, listed)
+            self.equations.balance(self._trial, listed, moved=moved)
             numbers = self.equations.numbers(self._trial, listed)
             for slot, found in zip(slots, numbers, strict=True):
                 live[slot].numbers = found
