@@ -7,6 +7,7 @@ by the smallest gap, and points with a gap larger than the remaining travel can 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +24,7 @@ _MOVES = 2000  # contact at a glancing angle is approached slowly
 _LEVELS = (3, 9, 25)  # points along a face's edge
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class OuterSurface:
     """The outer surface of a fingertip.
 
@@ -47,6 +48,18 @@ class OuterSurface:
         else:
             weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v])
         return np.asarray(np.einsum("ks,fki->fsi", weights, self.nodes[chosen]))
+
+    @cached_property
+    def used(self) -> NDArray[np.integer]:
+        """Numbers of the nodes that are a face's corner, ascending."""
+        return np.unique(self.faces)
+
+    @cached_property
+    def sizes(self) -> Floats:
+        """Of each face the largest distance between opposite corners [m], shape (F,)."""
+        corner = self.nodes[self.faces]
+        across = corner - np.roll(corner, -2, axis=1)
+        return np.asarray(np.linalg.norm(across, axis=2).max(axis=1))
 
 
 def first_contact(
@@ -74,10 +87,9 @@ def first_contact(
     turn = rotation_matrices(quaternion)
     target = np.asarray(target, np.float64)
     move = turn.T @ unit(direction)  # per metre, indenter frame
-    corner = surface.nodes[surface.faces]
-    sizes = np.linalg.norm(corner - np.roll(corner, -2, axis=1), axis=2).max(axis=1)
+    sizes = surface.sizes
     large = np.flatnonzero(sizes > _LARGE_M)
-    points = surface.nodes[np.unique(surface.faces)]
+    points = surface.nodes[surface.used]
     if len(large):
         count = min(2 + int(sizes.max() / _LARGE_M), 33)
         points = np.concatenate([points, surface.samples(count, large).reshape(-1, 3)])
@@ -122,7 +134,12 @@ def check_clear(indenter: Indenter, pose: Floats, surface: OuterSurface) -> floa
     Raises:
         SimulationError: It touches or is inside; says by how much.
     """
-    points = surface.samples(_LEVELS[0]).reshape(-1, 3)
+    at_nodes = np.empty(len(surface.nodes))
+    at_nodes[surface.used] = signed_distance(indenter, to_local(pose, surface.nodes[surface.used]))
+    at_corners = at_nodes[surface.faces].min(axis=1)
+    # Nowhere on a face is the gap smaller than at its corners by more than its size.
+    near = np.flatnonzero(at_corners - surface.sizes <= at_corners.min())
+    points = surface.samples(_LEVELS[0], near).reshape(-1, 3)
     gap = float(signed_distance(indenter, to_local(pose, points)).min())
     if gap <= 0.0:
         raise SimulationError(
