@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,9 @@ from palpate_fem.batched.step_kernels import (
 from palpate_fem.mechanics.load_stepping import CONTACT_SHARE
 from palpate_fem.mechanics.reference_element import face_element
 from palpate_fem.result import Convergence, IndentationStep
+
+COPYING = 4
+"""Threads that copy steps out of the pages that the device writes; it waits meanwhile."""
 
 
 class BatchedSteps:
@@ -54,6 +58,7 @@ class BatchedSteps:
         self._packed = wp.zeros((slots, width), dtype=wp.float64, device=device)
         locked = wp.get_device(device).is_cuda
         self._fetched = wp.zeros((slots, width), dtype=wp.float64, device="cpu", pinned=locked)
+        self._pool = ThreadPoolExecutor(COPYING, thread_name_prefix="palpate-steps")
 
     def make(
         self,
@@ -73,12 +78,12 @@ class BatchedSteps:
             convergences: How they were solved; penetrations are filled in.
         """
         self._sum(state, listed)
-        rows = self._fetch(state, listed)
+        # Copied at once, as the next fetch overwrites them; it takes long to get new pages.
+        rows = list(self._pool.map(np.copy, self._fetch(state, listed)))
         stiffness = self._equations.system.contact.stiffness
         steps = []
         for row, pose, fluid, convergence in zip(rows, poses, fluid_pa, convergences, strict=True):
-            own = row.copy()  # at once: pages are slow to get
-            fields, sums = own[:-SUMS], own[-SUMS:]
+            fields, sums = row[:-SUMS], row[-SUMS:]
             displacement, on_indenter, on_core = (
                 fields[k * 3 * self._nodes : (k + 1) * 3 * self._nodes].reshape(-1, 3)
                 for k in range(3)
