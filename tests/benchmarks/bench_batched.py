@@ -2,6 +2,7 @@
 
     python tests/benchmarks/bench_batched.py --slots 1 16 64 192 --out batched.json
     ... --edge-mm 0.47 0.6 0.38      other meshes, one after the other
+    ... --together 2                 slots and presses shared by two processes on the device
 
 Presses are the twin's: points of the pad in turn with the nine indenters, one 3 mm deep along the
 normal and one 1.5 mm deep at 30 degrees to it, in 20 steps. ``--check N`` computes N of the first
@@ -21,6 +22,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Barrier
 from typing import Any
 
 import numpy as np
@@ -147,12 +149,20 @@ class Progress:
 
 
 def time_slots(
-    tip: Fingertip, presses: list[BatchedPress], slots: int, device: str, *, parts: bool
+    tip: Fingertip,
+    presses: list[BatchedPress],
+    slots: int,
+    device: str,
+    *,
+    parts: bool = False,
+    start: Barrier | None = None,
 ) -> tuple[dict[str, Any], dict[int, IndentationResult]]:
-    """Solve presses in so many slots, twice: kernels are compiled for the first one."""
+    """Solve presses in so many slots; kernels are compiled for one before, then all wait."""
     indenters = [make_indenter(name) for name in indenter_names()]
     batched = BatchedFingertip(tip, indenters, slots=slots, device=device)
     for chosen in (presses[:1], presses):
+        if start is not None and chosen is presses:
+            start.wait()
         if parts:
             wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
         progress = Progress()
@@ -182,6 +192,43 @@ def time_slots(
     return run, results
 
 
+def time_share(
+    edge_m: float, count: int, slots: int, device: str, number: int, start: Barrier
+) -> dict[str, Any]:
+    """Solve one process's share of the presses."""
+    tip = Fingertip.pressurised(biotac(edge_m=edge_m))
+    presses = np.array_split(np.array(presses_on(tip, count), object), start.parties)[number]
+    run, _ = time_slots(tip, list(presses), slots // start.parties, device, start=start)
+    return run
+
+
+def time_together(
+    edge_m: float, count: int, slots: int, device: str, together: int
+) -> dict[str, Any]:
+    """Solve presses in several processes that share the device, its slots and the presses."""
+    context = multiprocessing.get_context("spawn")
+    with context.Manager() as manager, context.Pool(together) as pool:
+        start = manager.Barrier(together)
+        shares = [(edge_m, count, slots, device, number, start) for number in range(together)]
+        runs = pool.starmap(time_share, shares, chunksize=1)
+    each = [run["presses"] / count for run in runs]
+    mean = {
+        key: float(np.average([run[key] for run in runs], weights=each))
+        for key in ("iterations", "factorisations")
+    }
+    seconds = max(run["seconds"] for run in runs)
+    return mean | {
+        "unknowns": runs[0]["unknowns"],
+        "slots": slots,
+        "together": together,
+        "presses": count,
+        "seconds": seconds,
+        "ms_a_trajectory": 1e3 * seconds / count,
+        "ms_while_full": 1.0 / sum(1.0 / run["ms_while_full"] for run in runs),
+        "outcomes": sum((run["outcomes"] for run in runs), Counter()),
+    }
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -190,10 +237,13 @@ def main() -> None:
     parser.add_argument("--rounds", type=float, default=2.0, help="presses for each slot")
     parser.add_argument("--edge-mm", type=float, nargs="+", default=[0.47])
     parser.add_argument("--parts", action="store_true", help="time each kernel")
+    parser.add_argument("--together", type=int, default=1, help="processes that share the device")
     parser.add_argument("--check", type=int, default=0, help="presses to compare with the CPU's")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
+    if options.check and options.together > 1:
+        parser.error("--check compares with one process: leave --together out")
     pool = multiprocessing.get_context("spawn").Pool(options.processes)
     edge, checked = 1e-3 * options.edge_mm[0], options.check
     shares = [list(range(k, checked, options.processes)) for k in range(options.processes)]
@@ -206,12 +256,16 @@ def main() -> None:
         "against_cpu": [],
     }
     for edge_mm in options.edge_mm:
-        tip = Fingertip.pressurised(biotac(edge_m=1e-3 * edge_mm))
+        edge_m, together = 1e-3 * edge_mm, options.together
+        tip = Fingertip.pressurised(biotac(edge_m=edge_m)) if together == 1 else None
         for slots in options.slots:
             count = max(3, int(options.rounds * slots), 0 if report["against_cpu"] else checked)
-            run, results = time_slots(
-                tip, presses_on(tip, count), slots, options.device, parts=options.parts
-            )
+            results: dict[int, IndentationResult] = {}
+            if tip is None:
+                run = time_together(edge_m, count, slots, options.device, together)
+            else:
+                presses = presses_on(tip, count)
+                run, results = time_slots(tip, presses, slots, options.device, parts=options.parts)
             report["runs"].append(run | {"edge_mm": edge_mm})
             say(report["runs"][-1])
             if running and not report["against_cpu"]:
