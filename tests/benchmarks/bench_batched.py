@@ -6,8 +6,9 @@
 
 Presses are the twin's: points of the pad in turn with the nine indenters, one 3 mm deep along the
 normal and one 1.5 mm deep at 30 degrees to it, in 20 steps. ``--check N`` computes N of the first
-mesh on the CPU, too, in ``--processes`` processes. Results are written after each size.
-``docs/make_fem_batched.py`` makes a page of them.
+mesh on the CPU, too, in ``--processes`` processes. ``--tightened 1000`` divides all tolerances by
+so much, and evaluates mortar corrections eight times instead of twice. Results are written after
+each size. ``docs/make_fem_batched.py`` makes a page of them.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Barrier
 from typing import Any
@@ -32,6 +33,8 @@ from palpate.rigid import unit
 from palpate_fem.batched.fingertip import BatchedFingertip, BatchedPress
 from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
+from palpate_fem.mechanics.iteration import NewtonSettings
+from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.result import IndentationResult
@@ -62,9 +65,26 @@ def presses_on(tip: Fingertip, count: int) -> list[BatchedPress]:
     return presses
 
 
-def on_cpu(edge_m: float, count: int, numbers: list[int]) -> dict[int, dict[str, Any]]:
+def fingertip(edge_m: float, tightened: float = 1.0) -> Fingertip:
+    """The twin's, with tolerances that are ``tightened`` times smaller than usual."""
+    usual = NewtonSettings()
+    newton = replace(
+        usual,
+        tolerance=usual.tolerance / tightened,
+        volume_tolerance=usual.volume_tolerance / tightened,
+        gap_tolerance_m=usual.gap_tolerance_m / tightened,
+        traction_tolerance=usual.traction_tolerance / tightened,
+        iterations=usual.iterations if tightened == 1.0 else 3 * usual.iterations,
+        mortar_updates=usual.mortar_updates if tightened == 1.0 else 8,
+    )
+    return Fingertip.pressurised(biotac(edge_m=edge_m), None, SolverSettings(newton=newton))
+
+
+def on_cpu(
+    edge_m: float, tightened: float, count: int, numbers: list[int]
+) -> dict[int, dict[str, Any]]:
     """The same presses by the CPU's solver."""
-    tip = Fingertip.pressurised(biotac(edge_m=edge_m))
+    tip = fingertip(edge_m, tightened)
     presses = presses_on(tip, count)
     found = {}
     for k in numbers:
@@ -196,7 +216,7 @@ def time_share(
     edge_m: float, count: int, slots: int, device: str, number: int, start: Barrier
 ) -> dict[str, Any]:
     """Solve one process's share of the presses."""
-    tip = Fingertip.pressurised(biotac(edge_m=edge_m))
+    tip = fingertip(edge_m)
     presses = np.array_split(np.array(presses_on(tip, count), object), start.parties)[number]
     run, _ = time_slots(tip, list(presses), slots // start.parties, device, start=start)
     return run
@@ -240,14 +260,17 @@ def main() -> None:
     parser.add_argument("--together", type=int, default=1, help="processes that share the device")
     parser.add_argument("--check", type=int, default=0, help="presses to compare with the CPU's")
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--tightened", type=float, default=1.0, help="divides all tolerances")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    if options.check and options.together > 1:
-        parser.error("--check compares with one process: leave --together out")
+    if options.together > 1 and (options.check or options.tightened != 1.0):
+        parser.error("--check and --tightened are for one process: leave --together out")
     pool = multiprocessing.get_context("spawn").Pool(options.processes)
-    edge, checked = 1e-3 * options.edge_mm[0], options.check
+    edge, checked, tightened = 1e-3 * options.edge_mm[0], options.check, options.tightened
     shares = [list(range(k, checked, options.processes)) for k in range(options.processes)]
-    running = [pool.apply_async(on_cpu, (edge, checked, share)) for share in shares if share]
+    running = [
+        pool.apply_async(on_cpu, (edge, tightened, checked, share)) for share in shares if share
+    ]
     report: dict[str, Any] = {
         "schema": "palpate.batched-benchmark 1",
         "device": wp.get_device(options.device).name,
@@ -257,7 +280,7 @@ def main() -> None:
     }
     for edge_mm in options.edge_mm:
         edge_m, together = 1e-3 * edge_mm, options.together
-        tip = Fingertip.pressurised(biotac(edge_m=edge_m)) if together == 1 else None
+        tip = fingertip(edge_m, tightened) if together == 1 else None
         for slots in options.slots:
             count = max(3, int(options.rounds * slots), 0 if report["against_cpu"] else checked)
             results: dict[int, IndentationResult] = {}
