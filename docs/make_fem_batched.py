@@ -55,16 +55,21 @@ def outcomes(run: dict[str, Any]) -> str:
     return ", ".join(f"{count} {how}" for how, count in sorted(run["outcomes"].items()))
 
 
+def processes(run: dict[str, Any]) -> str:
+    """How many processes shared the device, and whether by NVIDIA's MPS."""
+    return f"{run.get('together', 1)}{', MPS' if run.get('mps') else ''}"
+
+
 def times(runs: list[dict[str, Any]]) -> str:
     """A row for each number of slots and each mesh."""
-    head = ["mesh [mm]", "unknowns", "slots", "presses", "ms a trajectory", "with all slots taken",
-            "iterations", "factorisations", "outcomes"]  # fmt: skip
+    head = ["mesh [mm]", "unknowns", "slots", "processes", "presses", "ms a trajectory",
+            "with all slots taken", "iterations", "factorisations", "outcomes"]  # fmt: skip
     return markdown_table(
         head,
         [
             [
                 f"{run['edge_mm']:g}", f"{run['unknowns']:,}", str(run["slots"]),
-                str(run["presses"]), f"{run['ms_a_trajectory']:.0f}",
+                processes(run), str(run["presses"]), f"{run['ms_a_trajectory']:.0f}",
                 f"**{run['ms_while_full']:.0f}**", f"{run['iterations']:.0f}",
                 f"{run['factorisations']:.0f}", outcomes(run),
             ]
@@ -174,15 +179,17 @@ def main() -> None:
     """Write page and pictures."""
     report, meshes = read("slots.json"), read("meshes.json")
     factor, sweeps = read("factor.json"), read("sweeps.json")
-    runs = sorted(report["runs"], key=lambda run: int(run["slots"])) + meshes["runs"]
-    draw(runs, FOLDER / "time.png")
+    runs = report["runs"] + meshes["runs"]
+    draw([run for run in runs if "together" not in run], FOLDER / "time.png")
     sections = [
         HEAD,
         f"## Time\n\n{report['device']}: `{report['command']}` and `{meshes['command']}`. "
-        f"{report['told']}\n",
+        f"{report['told']} Processes that share a GPU: `--device cuda:0` as often as there are to"
+        " be processes. *MPS*: NVIDIA's Multi-Process Service was running"
+        " (`nvidia-cuda-mps-control -d`), so that kernels of all of them run at once.\n",
         times(runs),
         "\n![time](fem-batched/time.png)\n",
-        "## Agreement with the solver on a core\n",
+        f"## Agreement with the solver on a core\n\n`{report['agreement_command']}`\n",
         agreement(report["against_cpu"], FOLDER),
         "\n## A factorisation and a solve\n",
         f"All fronts: `{factor['command']}`. {factor['told']}\n",
@@ -202,6 +209,10 @@ def main() -> None:
         f" {asked['slots']}` behind a router, each caller with one request after the other:"
         f" `{asked['command']}`. *Bare*: the same presses in one process, nothing between.\n",
         served(asked),
+        f"\nThe solver's process killed (SIGKILL) while 32 callers had requests there:"
+        f" `{asked['killed']['command']}`. All were answered; workers began, and the next process"
+        " took over what still waited.\n",
+        served(asked["killed"]),
     ]
     PAGE.write_text("\n".join(sections) + "\n", encoding="utf-8")
 
