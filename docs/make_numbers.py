@@ -82,11 +82,16 @@ def _fem() -> Iterator[Claim]:
     yield Claim("README.md", "| {seconds} s (goal 8; the paper's model", figures)
     yield Claim("README.md", "on six processors), {mib} MiB", figures)
     yield Claim("README.md", "an indentation of 3 mm in {rounded} s", figures)
-    runs = {run["slots"]: run for run in _read("fem-batched/slots.json")["runs"]}
-    figures = {f"ms{slots}": f"{run['ms_while_full']:.0f}" for slots, run in runs.items()}
+    figures = {
+        f"ms{run['slots']}{'x' * (run.get('together', 1) - 1)}{'m' if run.get('mps') else ''}": (
+            f"{run['ms_while_full']:.0f}"
+        )
+        for run in _read("fem-batched/slots.json")["runs"]
+    }
     yield Claim(
         "README.md",
-        "{ms192} ms a press (goals 100 and 30), {ms16} ms with 16 at once, {ms1} ms alone",
+        "{ms192} ms a press, {ms192xm} with two processes that share it (goals 100 and 30), "
+        "{ms16} ms with 16 at once, {ms1} ms alone",
         figures,
     )
     yield Claim(
@@ -94,6 +99,12 @@ def _fem() -> Iterator[Claim]:
         "takes **{ms192} ms with 192 slots taken**",
         figures,
     )
+    yield Claim(
+        "docs/adr/0026-many-at-once.md",
+        "two take {ms192x} ms, two under NVIDIA's MPS **{ms192xm} ms**, three {ms192xxm}",
+        figures,
+    )
+    yield Claim("docs/twin.md", "{ms192x} ms a press instead of {ms192}, and {ms192xm}\n", figures)
 
 
 def _rows(name: str) -> dict[tuple[str, str], dict[str, float]]:
