@@ -15,7 +15,7 @@ from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.state import BatchedState, Listed, SlotNumbers
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import PosedIndenter
-from palpate_fem.mechanics.iteration import NewtonSettings
+from palpate_fem.mechanics.iteration import NewtonSettings, Step
 from palpate_fem.mechanics.load_stepping import LoadStepping
 from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.solver import Fingertip
@@ -53,7 +53,7 @@ class Case:
     """A press on the CPU: two states near its end, and what the CPU's classes say of them.
 
     The tangent is that of ``first``; all that Newton's method does with it happens at ``second``,
-    which ends at ``moved``.
+    which ends at ``moved``. ``following`` are targets with offsets that follow.
     """
 
     run: LoadStepping
@@ -67,6 +67,7 @@ class Case:
     values: tuple[Floats, Floats]
     vectors: dict[str, Floats]
     targets: tuple[Floats, Floats, Floats, Floats]
+    following: tuple[Floats, Floats, Floats, Floats]
     statuses: Floats
     corrected: SolutionState
 
@@ -112,7 +113,10 @@ def press(finger: Fingertip, number: int) -> Case:
         "coupled": -system.coupled_force(),
         "product": system.unsymmetric_product(change),
     }
+    offsets = system.offset_changes(change)
+    vectors["offsets"] = system.offset_force(offsets)
     targets = system.updated_pressures(move)
+    following = system.updated_pressures(move, offsets)
     moved = second.copy()
     at_moved = step(finger, moved, indenter, at_second, change, DAMPINGS[number])
     changed_again = system.sets_changed
@@ -132,6 +136,7 @@ def press(finger: Fingertip, number: int) -> Case:
         values=(values, kept),
         vectors=vectors,
         targets=targets,
+        following=following,
         statuses=np.asarray(statuses, np.float64),
         corrected=corrected,
     )
@@ -149,8 +154,9 @@ def step(
     settings = NewtonSettings(largest_move_m=LARGEST_MOVE_M)
     newton = NewtonSolver(finger.system, finger.newton.factor, settings)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(newton, "_linear_solution", lambda *_: (change, PRESSURE_CHANGE_PA))
-        return newton._step(state, indenter, balance, None, damping)
+        solution = (change, PRESSURE_CHANGE_PA, None)
+        patch.setattr(newton, "_linear_solution", lambda *_, **__: solution)
+        return newton._step(state, indenter, balance, None, Step(damping))
 
 
 class Batch:

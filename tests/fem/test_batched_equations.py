@@ -262,6 +262,33 @@ def test_targets_of_the_condensed_unknowns(batch: Batch) -> None:
             same(batch.nodal(array, slot), expected)
 
 
+def test_offsets_that_follow(batch: Batch) -> None:
+    """In two of three slots; the targets of the third are those of offsets that are kept."""
+    batch.run(batch.all, "second")
+    equations, following = batch.equations, batch.equations.listed(np.array(PLACES[1:]))
+    equations.volume_gradient(batch.all, batch.vectors, 1)
+    before = batch.vectors.numpy()[:, 1].copy()
+    equations.subtract_offset_force(following, batch.change, 0, batch.vectors, 1)
+    found = before - batch.vectors.numpy()[:, 1]
+    equations.targets(batch.all, batch.change, 0, following=following)
+    # The offsets of a flat face, the cube's, do not change.
+    largest = [np.abs(case.vectors["offsets"]).max() for case in batch.cases]
+    assert min(largest[:2]) > 1e-3
+    for number, (slot, case) in enumerate(zip(PLACES, batch.cases, strict=True)):
+        expected = case.vectors["offsets"] if number else np.zeros_like(found[slot])
+        assert np.abs(found[slot] - expected).max() <= ROUNDING * max(largest)
+        targets = case.following if number else case.targets
+        arrays = (
+            equations._target,
+            equations.inner.target,
+            equations.outer.target,
+            equations.outer.target_traction,
+        )
+        for array, wanted in zip(arrays, targets, strict=True):
+            same(batch.nodal(array, slot), wanted, 1e-11)
+    assert np.abs(batch.cases[1].following[2] - batch.cases[1].targets[2]).max() > 1.0
+
+
 def test_longest_moves(batch: Batch) -> None:
     longest = batch.equations.longest_move(batch.all, batch.change, 0)
     for found, case in zip(longest, batch.cases, strict=True):

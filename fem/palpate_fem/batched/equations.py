@@ -484,16 +484,40 @@ class BatchedEquations:
         self._spread(state, listed, field, change=moved)
         self._gather_load(listed, -1.0, field, vectors, lane, add=True)
 
+    def subtract_offset_force(
+        self, listed: Listed, change: wp.array, of: int, vectors: wp.array, lane: int
+    ) -> None:
+        """Subtract `EquilibriumSystem.offset_force` of a change of the free unknowns.
+
+        How the offsets change is kept for `targets`.
+        """
+        moved, field = self._as_field(listed, change, of), self._product
+        self._clear(listed, field)
+        for surface, items in self._mortar_surfaces(listed):
+            self._launch(
+                kernels.clear_numbers,
+                (len(listed.slots), self._nodes),
+                [listed.slots],
+                [surface.offset_change],
+            )
+            surface.add_offset_changes(items, self._margin, moved)
+            surface.add_offset_load(items, field)
+        self._gather_load(listed, -1.0, field, vectors, lane, add=True)
+
+    def _mortar_surfaces(self, listed: Listed) -> list[tuple[BatchedSurface, wp.array]]:
+        """Surfaces whose gaps have offsets, and their listed faces."""
+        if not self.system.contact.mortar:
+            return []
+        outer = [(self.outer, listed.outer)]
+        return [*outer, (self.inner, listed.inner)] if self._core else outer
+
     def _spread(
         self, state: BatchedState, listed: Listed, field: wp.array, change: wp.array | None
     ) -> None:
         """Add mortar's loads at neighbours, by a change of the nodes or what they lack."""
-        if not self.system.contact.mortar:
-            return
-        surfaces = [(self.outer, listed.outer, state.indenter_pressure)]
-        if self._core:
-            surfaces.append((self.inner, listed.inner, state.core_pressure))
-        for surface, items, pressure in surfaces:
+        for surface, items in self._mortar_surfaces(listed):
+            on_indenter = surface is self.outer
+            pressure = state.indenter_pressure if on_indenter else state.core_pressure
             surface.add_spread(items, self._margin, pressure, change, field)
 
     def longest_move(self, listed: Listed, change: wp.array, lane: int) -> Floats:
@@ -509,8 +533,17 @@ class BatchedEquations:
         square = self._longest.numpy()[listed.numbers]
         return np.asarray(np.where(square < 1e299, np.sqrt(square), np.inf))
 
-    def targets(self, listed: Listed, change: wp.array, lane: int) -> None:
-        """Recover the condensed unknowns; see `EquilibriumSystem.updated_pressures`."""
+    def targets(
+        self, listed: Listed, change: wp.array, lane: int, *, following: Listed | None = None
+    ) -> None:
+        """Recover the condensed unknowns; see `EquilibriumSystem.updated_pressures`.
+
+        Args:
+            listed: Slots.
+            change: Of the free unknowns [m].
+            lane: Of ``change``.
+            following: Those of them whose offsets follow, as `subtract_offset_force` found.
+        """
         moved = self._as_field(listed, change, lane)
         self._launch(
             element_kernels.pressure_update,
@@ -520,6 +553,12 @@ class BatchedEquations:
         )
         for surface, items in ((self.inner, listed.inner), (self.outer, listed.outer)):
             surface.set_targets(items, moved)
+        if following is None:
+            return
+        for surface, items in self._mortar_surfaces(following):
+            self._copy(following, 3 * self._nodes, moved, self._product)
+            surface.move_along_normals(items, moved, self._product)
+            surface.set_targets(items, self._product)
 
     def move(
         self,

@@ -322,15 +322,17 @@ class BatchedFingertip:
             return
         equations, linear, fraction = self.equations, self.linear, np.zeros(self.slots)
         listed = equations.listed(np.array(slots))
+        renewing = [slot for slot in slots if _renews(live[slot])]
+        following = equations.listed(np.array(renewing)) if renewing else None
         missing = [self.tip.cavity_m3 - _known(live[slot]).volume for slot in slots]
-        linear.solve(self._trial, listed, np.array(missing))
+        linear.solve(self._trial, listed, np.array(missing), following=following)
         longest = equations.longest_move(listed, linear.change, CHANGE)
         most = self.tip.settings.newton.largest_move_m
         for slot, far in zip(slots, longest, strict=True):
             wanted = live[slot].wanted
             assert isinstance(wanted, Step)
             fraction[slot] = min(wanted.damping, most / max(float(far), 1e-300))
-        equations.targets(listed, linear.change, CHANGE)
+        equations.targets(listed, linear.change, CHANGE, following=following)
         self._start.copy_slots(self._trial, listed.slots)
         left = [slot for slot, far in zip(slots, longest, strict=True) if np.isfinite(far)]
         answers: dict[int, SlotNumbers] = {}
@@ -342,6 +344,8 @@ class BatchedFingertip:
                 self._trial, self._start, some, linear.change, CHANGE, fraction,
                 linear.pressure_change,
             )  # fmt: skip
+            if again := [slot for slot in left if slot in renewing]:
+                equations.correct_contact(self._trial, equations.listed(np.array(again)))
             equations.balance(self._trial, some)
             for slot, found in zip(left, equations.numbers(self._trial, some), strict=True):
                 if found.smallest_jacobian > 0.0:
@@ -430,6 +434,11 @@ class BatchedFingertip:
 
 def _failed(problem: str) -> SimulationError:
     return SimulationError(problem, remedy="use smaller increments")
+
+
+def _renews(one: _Live) -> bool:
+    assert isinstance(one.wanted, Step)
+    return one.wanted.renews
 
 
 def _known(one: _Live) -> SlotNumbers:

@@ -456,8 +456,10 @@ def fluid_pressure_change(
     missing_in: wp.array(dtype=wp.float64),
     moved_in: wp.array(dtype=wp.float64),
     stiffness_in: wp.array(dtype=wp.float64),
+    further_out: wp.array(dtype=wp.float64),
     change_out: wp.array(dtype=wp.float64),
 ):
-    """Pressure by which the change of the skin has the volume that is missing."""
+    """Further pressure by which the change of the skin has the volume that is missing."""
     slot = listed[wp.tid()]
-    change_out[slot] = (missing_in[slot] - moved_in[slot]) / stiffness_in[slot]
+    further_out[slot] = (missing_in[slot] - moved_in[slot]) / stiffness_in[slot]
+    change_out[slot] += further_out[slot]

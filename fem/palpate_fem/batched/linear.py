@@ -51,6 +51,8 @@ class BatchedLinearSystem:
         self._border = wp.zeros(shape, dtype=wp.float64, device=device)
         self._load = wp.zeros(shape, dtype=wp.float64, device=device)
         self.pressure_change = wp.zeros(slots, dtype=wp.float64, device=device)
+        self._ones = wp.full(slots, 1.0, dtype=wp.float64, device=device)
+        self._further = wp.zeros(slots, dtype=wp.float64, device=device)
         self._missing = wp.zeros(slots, dtype=wp.float64, device=device)
         self._stiffness = wp.zeros(slots, dtype=wp.float64, device=device)
         self._moved = wp.zeros(slots, dtype=wp.float64, device=device)
@@ -77,13 +79,21 @@ class BatchedLinearSystem:
         self._has_border[listed.numbers] = False
         return np.asarray(self.factor.bad.numpy()[listed.numbers] == 0)
 
-    def solve(self, state: BatchedState, listed: Listed, missing_m3: Floats) -> None:
+    def solve(
+        self,
+        state: BatchedState,
+        listed: Listed,
+        missing_m3: Floats,
+        *,
+        following: Listed | None = None,
+    ) -> None:
         """Change of the free unknowns and of the fluid pressure; see `NewtonSolver`.
 
         Args:
             state: Present states, just evaluated.
             listed: Slots.
             missing_m3: Volume that each cavity lacks [m^3], (m,).
+            following: Those of the slots whose gaps' offsets follow the change.
         """
         equations, slots = self.equations, listed.slots
         equations.right_hand_side(state, listed, self.change, CHANGE)
@@ -99,24 +109,30 @@ class BatchedLinearSystem:
             self._has_border[new] = True
         else:
             self.factor.solve(slots, self.change, 1)
-        # (S + U) x = S answer + coupled, by one correction.
-        equations.coupled(state, listed, self._load, 0)
-        equations.subtract_unsymmetric_product(state, listed, self.change, CHANGE, self._load, 0)
-        self.factor.solve(slots, self._load, 1)
-        every = self.pressure_change
-        every.fill_(1.0)
-        self._add(listed, self._load, 0, every, self.change, CHANGE)
         missing = np.zeros(equations.slots)
         missing[listed.numbers] = missing_m3
         self._missing.assign(missing)
+        self.pressure_change.zero_()
+        self._seal(listed)
+        # (S + U) x = S answer + coupled, by one correction.
+        equations.coupled(state, listed, self._load, 0)
+        equations.subtract_unsymmetric_product(state, listed, self.change, CHANGE, self._load, 0)
+        if following is not None:
+            equations.subtract_offset_force(following, self.change, CHANGE, self._load, 0)
+        self.factor.solve(slots, self._load, 1)
+        self._add(listed, self._load, 0, self._ones, self.change, CHANGE)
+        self._seal(listed)
+
+    def _seal(self, listed: Listed) -> None:
+        """Change the fluid pressures so that the cavities get what they lack."""
         self._product(listed, self._border, GRADIENT, self.change, CHANGE, self._moved)
         self._launch(
             kernels.fluid_pressure_change,
             len(listed.numbers),
-            [slots, self._missing, self._moved, self._stiffness],
-            [self.pressure_change],
+            [listed.slots, self._missing, self._moved, self._stiffness],
+            [self._further, self.pressure_change],
         )
-        self._add(listed, self._border, ANSWER, self.pressure_change, self.change, CHANGE)
+        self._add(listed, self._border, ANSWER, self._further, self.change, CHANGE)
 
     def _product(
         self,

@@ -237,6 +237,84 @@ def spread_load(
 
 
 @wp.kernel
+def offset_changes(
+    faces: wp.array2d(dtype=wp.int32),
+    shape: wp.array2d(dtype=wp.float64),
+    weight: wp.array3d(dtype=wp.float64),
+    corner_area: wp.array2d(dtype=wp.float64),
+    area: wp.array(dtype=wp.float64),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
+    margin: wp.float64,
+    gap_in: wp.array(dtype=wp.float64),
+    normal_in: wp.array(dtype=wp.vec3d),
+    outward_in: wp.array2d(dtype=wp.vec3d),
+    change_in: wp.array(dtype=wp.vec3d),
+    offset_out: wp.array2d(dtype=wp.float64),
+):
+    """Add how a change of the nodes changes the offsets of their gaps; `gap_offsets`, derived."""
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    slot = f // faces.shape[0]
+    begin = slot * nodes
+    if touchable(faces, gap_in, margin, s, begin):
+        for a in range(faces.shape[1]):
+            node = faces[s, a]
+            own = wp.dot(normal_in[begin + node], change_in[begin + node])
+            total = -corner_area[s, a] * own
+            for q in range(shape.shape[0]):
+                moved = at_point(faces, shape, change_in, s, q, begin)
+                total += weight[s, q, a] * wp.dot(outward_in[f, q], moved)
+            wp.atomic_add(offset_out, slot, node, total / area[node])
+
+
+@wp.kernel
+def offset_load(
+    faces: wp.array2d(dtype=wp.int32),
+    area: wp.array2d(dtype=wp.float64),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
+    slope_in: wp.array2d(dtype=wp.vec3d),
+    offset_in: wp.array2d(dtype=wp.float64),
+    force_out: wp.array(dtype=wp.vec3d),
+):
+    """Add the forces by which touching points resist changes of their offsets."""
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    slot = f // faces.shape[0]
+    for a in range(faces.shape[1]):
+        node = faces[s, a]
+        size = area[s, a] * offset_in[slot, node]
+        if size != wp.float64(0.0) and wp.length(slope_in[f, a]) > wp.float64(0.0):
+            wp.atomic_add(force_out, slot * nodes + node, size * slope_in[f, a])
+
+
+@wp.kernel
+def move_along_normals(
+    faces: wp.array2d(dtype=wp.int32),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
+    slope_in: wp.array2d(dtype=wp.vec3d),
+    offset_in: wp.array2d(dtype=wp.float64),
+    change_in: wp.array(dtype=wp.vec3d),
+    change_out: wp.array(dtype=wp.vec3d),
+):
+    """Add changes of offsets, along the normals, to a change of the nodes that touch.
+
+    Corners of several faces are one node, with one normal, and write the same.
+    """
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    slot = f // faces.shape[0]
+    for a in range(faces.shape[1]):
+        size = wp.length(slope_in[f, a])
+        if size > wp.float64(0.0):
+            node = faces[s, a]
+            at = slot * nodes + node
+            change_out[at] = change_in[at] + (offset_in[slot, node] / size) * slope_in[f, a]
+
+
+@wp.kernel
 def place_anchors(
     items: wp.array(dtype=wp.int32),
     faces: wp.array2d(dtype=wp.int32),

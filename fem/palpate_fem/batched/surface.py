@@ -58,6 +58,7 @@ class BatchedSurface:
             room(wp.float64, slots * nodes),
         )
         self.node_normal = room(wp.vec3d, slots * nodes)
+        self.offset_change = room(wp.float64, slots, nodes)
         self.force = room(wp.vec3d, slots * nodes)
         self.results = [
             self.status, self.gap, self.wanted, self.slope, self.misfit, self.tangent,
@@ -103,6 +104,34 @@ class BatchedSurface:
              self.wanted, pressure, field if change is None else change, int(change is not None)],
             [field],
         )  # fmt: skip
+
+    def add_offset_changes(self, items: wp.array, margin: wp.float64, moved: wp.array) -> None:
+        """Add to ``offset_change`` how a change of the nodes changes the offsets of their gaps."""
+        self._launch(
+            mortar_kernels.offset_changes,
+            items,
+            [self.faces, self.mortar_shape, self.weight, self.corner_area, self.node_area,
+             self._each, items, margin, self.node_gap, self.node_normal, self.outward, moved],
+            [self.offset_change],
+        )  # fmt: skip
+
+    def add_offset_load(self, items: wp.array, field: wp.array) -> None:
+        """Add the forces by which touching points resist ``offset_change`` to a nodal field."""
+        self._launch(
+            mortar_kernels.offset_load,
+            items,
+            [self.faces, self.area, self._each, items, self.frozen_slope, self.offset_change],
+            [field],
+        )
+
+    def move_along_normals(self, items: wp.array, moved: wp.array, field: wp.array) -> None:
+        """Add ``offset_change``, along the normals, to a change of the nodes; into a copy of it."""
+        self._launch(
+            mortar_kernels.move_along_normals,
+            items,
+            [self.faces, self._each, items, self.frozen_slope, self.offset_change, moved],
+            [field],
+        )
 
     def add_tangent(self, items: wp.array, blocks_each: int, blocks: wp.array) -> None:
         """Add the symmetric tangents of touching points."""

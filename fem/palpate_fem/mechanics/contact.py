@@ -226,6 +226,20 @@ class ContactSurface:
             lacking = np.where(touching, self._wanted - self._pressure, 0.0)
             force.numpy()[:] -= self._correction.load(lacking)
 
+    def offset_change(self, moved: Floats) -> Floats:
+        """How a change (V, 3) of the nodes changes the offsets of their gaps [m], (V,)."""
+        each = self._correction.spread.T @ moved.ravel()
+        sums = np.bincount(self._corners.ravel(), each, minlength=self.nodes)
+        return np.asarray(sums / np.where(self.mortar.area > 0.0, self.mortar.area, np.inf))
+
+    def add_offset_load(self, offset: Floats, force: Floats) -> None:
+        """Add the forces (V, 3) by which touching points resist changes (V,) of their offsets."""
+        slope = self._frozen[0].numpy()
+        touching = np.flatnonzero(slope.any(axis=(1, 2)))
+        corners = self._corners[touching]
+        size = self.area_values[touching] * offset[corners]
+        np.add.at(force, corners, size[..., None] * slope[touching])
+
     @property
     def changed(self) -> bool:
         """Whether the status of any point differs from the frozen one."""
@@ -251,8 +265,23 @@ class ContactSurface:
         """Largest difference between tractions and what the friction law demands [Pa]."""
         return float(np.abs(self._wanted_traction - traction).max()) if self.count else 0.0
 
-    def updated_pressure(self, moved: wp.array) -> tuple[Floats, Floats]:
-        """Pressures (F, Q) and tractions (F, Q, 3) after a change of the nodal positions [Pa]."""
+    def updated_pressure(
+        self, moved: Floats, offset: Floats | None = None
+    ) -> tuple[Floats, Floats]:
+        """Pressures (F, Q) and tractions (F, Q, 3) after a change of the nodal positions [Pa].
+
+        Args:
+            moved: The change [m], (V, 3).
+            offset: That of the offsets of the nodes' gaps [m], (V,), which is as a move along the
+                normal; None = none.
+        """
+        if offset is not None:
+            slope = self._frozen[0].numpy()
+            touching = slope.any(axis=2)
+            nodes, normal, moved = self._corners[touching], slope[touching], moved.copy()
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            # Corners of several faces are one node, with one normal.
+            moved[nodes] = moved[nodes] + offset[nodes][:, None] * normal
         pressure = np.zeros(self.area_values.shape)
         traction = np.zeros((*pressure.shape, 3))
         launch(
@@ -268,7 +297,7 @@ class ContactSurface:
                 self._frozen[0],
                 self.wanted_traction_array,
                 self._frozen[1],
-                moved,
+                vec3s(moved),
             ],
             [scalars(pressure), vec3s(traction)],
         )

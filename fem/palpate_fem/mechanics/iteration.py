@@ -20,6 +20,9 @@ DAMP_FROM = 6
 MORTAR_FROM = 1e-2
 """Error from which on the mortar correction is evaluated again: near enough to the solution."""
 
+CONTINUED_UPDATES = 2
+"""How often, at most, continuation does so; each time leaves a tenth of its error or less."""
+
 HOPELESS = 0.3
 """Error at which Newton's method, after some iterations, gives up; continuation takes over."""
 
@@ -43,9 +46,9 @@ class NewtonSettings:
         iterations: Most iterations of Newton's method.
         patience: Iterations of Newton's method after which an error above `HOPELESS` ends it.
         pseudo_transient_iterations: Most iterations of pseudo-transient continuation.
-        mortar_updates: How often the mortar correction of contact, which is first evaluated at the
-            start, is evaluated again near the solution. Each time leaves a tenth of its error or
-            less.
+        mortar_updates: How often, at most, the mortar correction of contact, which is first
+            evaluated at the start, is evaluated again near the solution: there, and after each
+            iteration from there on.
         linear_tolerance: Share of a linear solution below which one correction for the unsymmetric
             tangent is enough; else GMRES goes on until a third of this share of it is left over.
         largest_move_m: Displacement of any node in one iteration; longer moves are shortened [m].
@@ -62,7 +65,7 @@ class NewtonSettings:
     iterations: int = 20
     patience: int = 10
     pseudo_transient_iterations: int = field(default=40, metadata={"stored_as": "creep_iterations"})
-    mortar_updates: int = 2
+    mortar_updates: int = 7
     linear_tolerance: float = 0.3
     largest_move_m: float = 0.25e-3
     keep_factor: float = 0.3
@@ -224,9 +227,12 @@ class Step:
 
     Attributes:
         damping: Share of the solution to move by.
+        renews: Whether the mortar correction is evaluated again where the step ends, and the
+            solution tells how the gaps' offsets follow it; else they are kept.
     """
 
     damping: float
+    renews: bool = False
 
 
 IterationRequest = Correct | Factorise | Step
@@ -262,15 +268,18 @@ def newton_iterations(
     """
     limit = settings.pseudo_transient_iterations if continuation else settings.iterations
     fits, elastic = False, not (has_elastic and settings.keep_elastic)
-    updates, done = 0, 0  # of the mortar correction, and the iterations before the last one
+    most = min(settings.mortar_updates, CONTINUED_UPDATES if continuation else limit)
+    updates, done = 0, 0  # of the mortar correction, and the iterations before it was asked for
+    renews = False
     found, error = start, largest_error(start, volume)
     report.residuals.append(error)
     while True:
         moved = report.iterations > done
-        if moved and updates < settings.mortar_updates and error < MORTAR_FROM:
+        if moved and updates < most and not renews and error < MORTAR_FROM:
             found, changed = cast("Evaluated", (yield Correct()))
             error = largest_error(found, volume)
             updates, done = updates + 1, report.iterations
+            renews = updates < most and not continuation
             fits = fits and not changed  # the state hardly moves any more
         if has_converged(found, volume, settings):
             report.converged = True
@@ -286,11 +295,13 @@ def newton_iterations(
                 yield Factorise(elastic)
                 report.factorisations += 1
             damping = 1.0 if continuation else damping_after(report.residuals[done:])
-            found, changed = cast("Evaluated", (yield Step(damping)))
+            found, changed = cast("Evaluated", (yield Step(damping, renews)))
         except SimulationError as failure:
             report.reason = failure.problem
             return found
         report.iterations += 1
+        updates += renews
+        renews = renews and updates < most
         before, error = error, largest_error(found, volume)
         report.residuals.append(error)
         if not np.isfinite(error):

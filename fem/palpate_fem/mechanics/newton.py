@@ -24,10 +24,11 @@ from palpate_fem.mechanics.iteration import (
     NewtonReport,
     NewtonSettings,
     PseudoTransient,
+    Step,
     newton_iterations,
 )
 from palpate_fem.mechanics.state import ForceBalance, SolutionState
-from palpate_fem.mechanics.system import EquilibriumSystem
+from palpate_fem.mechanics.system import EquilibriumSystem, OffsetChanges
 from palpate_fem.sparse.blas import one_thread
 from palpate_fem.sparse.factor import SparseFactor
 
@@ -104,7 +105,7 @@ class NewtonSolver:
                     if isinstance(wanted, Correct):
                         balance = system.corrected_balance(state, indenter)
                     else:
-                        balance = self._step(state, indenter, balance, volume, wanted.damping)
+                        balance = self._step(state, indenter, balance, volume, wanted)
                     answer = balance, system.sets_changed
             except SimulationError as failure:
                 with contextlib.suppress(StopIteration):
@@ -143,18 +144,20 @@ class NewtonSolver:
         indenter: PosedIndenter | None,
         balance: ForceBalance,
         volume: float | None,
-        damping: float,
+        wanted: Step,
     ) -> ForceBalance:
         """Solve the linear system once and move along its solution, shortened where needed."""
         settings, system = self.settings, self.system
-        change, pressure_change = self._linear_solution(state, balance, volume)
+        change, pressure_change, offsets = self._linear_solution(
+            state, balance, volume, renews=wanted.renews
+        )
         move = np.zeros_like(state.position)
         move.reshape(-1)[system.pattern.free] = change
         if not np.isfinite(change).all():
             raise SimulationError("the linear solve gave no number", remedy="smaller increments")
         longest = float(np.sqrt((move * move).sum(axis=1).max()))
-        fraction = min(damping, settings.largest_move_m / max(longest, 1e-300))
-        targets = system.updated_pressures(move)
+        fraction = min(wanted.damping, settings.largest_move_m / max(longest, 1e-300))
+        targets = system.updated_pressures(move, offsets)
         start = state.copy()
         for _ in range(8):
             state.position[:] = start.position + fraction * move
@@ -173,6 +176,8 @@ class NewtonSolver:
             ):
                 now[target <= 0.0] = 0.0
             state.traction[targets[2] <= 0.0] = 0.0
+            if wanted.renews:
+                system.correct_contact(state, indenter)
             trial = system.balance(state, indenter)
             if trial.smallest_jacobian > 0.0:
                 return trial
@@ -180,9 +185,9 @@ class NewtonSolver:
         raise SimulationError("an element turns inside out", remedy="use smaller increments")
 
     def _linear_solution(
-        self, state: SolutionState, balance: ForceBalance, volume: float | None
-    ) -> tuple[Floats, float]:
-        """Change of the free unknowns (n,) and of the fluid pressure [Pa].
+        self, state: SolutionState, balance: ForceBalance, volume: float | None, *, renews: bool
+    ) -> tuple[Floats, float, OffsetChanges | None]:
+        """Change of the free unknowns (n,), of the fluid pressure [Pa], and of the gaps' offsets.
 
         With the fluid sealed, the tangent K is bordered by the volume gradient b::
 
@@ -190,6 +195,12 @@ class NewtonSolver:
             [ b^T  0 ] [dp] = [ V_goal - V  ]
 
         and solved by block elimination: dx = x0 + dp K^-1 b, with b^T dx = V_goal - V.
+
+        Args:
+            state: Where.
+            balance: There.
+            volume: Volume that the cavity has to take [m^3]; None = the fluid pressure is given.
+            renews: Whether the offsets follow the change; else they are kept, and None returned.
         """
         system = self.system
         # The pressures are condensed, so their misfit loads the nodes.
@@ -197,7 +208,7 @@ class NewtonSolver:
         near = balance.residual < WHOLE_BELOW
         if self._continued is not None and volume is not None and near:
             right -= system.coupled_force()
-            return self._whole_solution(self._continued, right, balance, volume)
+            return *self._whole_solution(self._continued, right, balance, volume), None
         if volume is None or self._border is not None:
             change = np.asarray(self.factor.solve(right))
         else:
@@ -206,14 +217,26 @@ class NewtonSolver:
             # K^-1 b leaves out the unsymmetric share. The volume is met exactly all the same; the
             # error of the forces is small, as the pressure changes little in a step.
             self._border = (gradient, answer)
+        missing = 0.0 if volume is None else volume - balance.volume
+        sealed = volume is not None
+        change, pressure_change = self._sealed(change, missing) if sealed else (change, 0.0)
+        offsets = None
         if system.is_unsymmetric:
-            change = self._with_unsymmetric_share(change, -system.coupled_force())
-        if volume is None or self._border is None:
-            return change, 0.0
+            load = -system.coupled_force()
+            if renews:
+                offsets = system.offset_changes(change)
+                load -= system.offset_force(offsets)
+            more = self._correction(change, load, whole=not renews)
+            more, further = self._sealed(more, 0.0) if sealed else (more, 0.0)
+            change, pressure_change = change + more, pressure_change + further
+        return change, pressure_change, offsets
+
+    def _sealed(self, change: Floats, missing_m3: float) -> tuple[Floats, float]:
+        """A change with the fluid pressure by which the cavity gets what it lacks; that, too."""
+        assert self._border is not None
         gradient, answer = self._border
-        stiffness = float(gradient @ answer)
-        pressure_change = (volume - balance.volume - float(gradient @ change)) / stiffness
-        return change + pressure_change * answer, pressure_change
+        pressure = (missing_m3 - float(gradient @ change)) / float(gradient @ answer)
+        return change + pressure * answer, pressure
 
     def _whole_solution(
         self, values: Floats, right: Floats, balance: ForceBalance, volume: float
@@ -263,26 +286,27 @@ class NewtonSolver:
         )
         return np.asarray(solution[:count]), float(solution[count])
 
-    def _with_unsymmetric_share(self, answer: Floats, coupled: Floats) -> Floats:
-        """Correct a solution of the symmetric tangent for the unsymmetric share.
+    def _correction(self, answer: Floats, load: Floats, *, whole: bool) -> Floats:
+        """What a solution of the symmetric tangent lacks because of the unsymmetric share.
 
         That is sliding friction, which follows the pressure, and mortar's loads at neighbours.
 
         Args:
             answer: Solution with the symmetric tangent S.
-            coupled: Further load, which the unsymmetric share U times the answer nearly cancels.
+            load: Further load, which the unsymmetric share U times the answer nearly cancels.
+            whole: Whether to go on with GMRES where one correction is not enough.
 
         Returns:
-            Approximate solution of (S + U) x = S answer + coupled.
+            Approximate solution x of (S + U) x = load - U answer.
         """
-        left_over = coupled - self.system.unsymmetric_product(answer)
+        left_over = load - self.system.unsymmetric_product(answer)
         more = np.asarray(self.factor.solve(left_over))
         tolerance = self.settings.linear_tolerance
-        if np.linalg.norm(more) > tolerance * np.linalg.norm(answer):
+        if whole and np.linalg.norm(more) > tolerance * np.linalg.norm(answer):
             operator = LinearOperator(
                 (len(answer), len(answer)),
                 matvec=lambda v: v + self.factor.solve(self.system.unsymmetric_product(v)),
                 dtype=np.float64,
             )
             more, _ = gmres(operator, more, rtol=tolerance / 3, atol=0.0, restart=8, maxiter=5)
-        return np.asarray(answer + more)
+        return np.asarray(more)

@@ -31,6 +31,9 @@ from palpate_fem.mechanics.state import TRACTION_FLOOR_PA, ForceBalance, Solutio
 from palpate_fem.mesh.core import DistanceGrid
 from palpate_fem.mesh.solid import SolidMesh
 
+OffsetChanges = tuple[Floats, Floats]
+"""How the offsets of the gaps of the nodes change [m], to the indenter and to the core, (V,)."""
+
 
 @dataclass(frozen=True, slots=True)
 class TangentPattern:
@@ -283,8 +286,7 @@ class EquilibriumSystem:
 
     def unsymmetric_product(self, change: Floats) -> Floats:
         """(Tangent - its symmetric approximation) times a change of the free unknowns, (n,)."""
-        full = np.zeros_like(self.mesh.nodes)
-        full.reshape(-1)[self.pattern.free] = change
+        full = self._as_field(change)
         product = np.zeros_like(full)
         for surface in (self.outer, self.inner):
             surface.add_unsymmetric_product(vec3s(full), vec3s(product))
@@ -295,16 +297,35 @@ class EquilibriumSystem:
         """Whether the active set has changed since the tangent: who touches, sticks or slides."""
         return self.outer.changed or self.inner.changed
 
-    def updated_pressures(self, change: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    def updated_pressures(
+        self, change: Floats, offsets: OffsetChanges | None = None
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         """Recover the condensed unknowns after a change (V, 3) of the last evaluated state.
+
+        Args:
+            change: Of the nodal positions [m].
+            offsets: Of the gaps' offsets; None = none.
 
         Returns:
             Pressures of the elements (E,), on the core and on the indenter (faces, points), and the
             tractions on the indenter (faces, points, 3).
         """
-        moved = vec3s(change)
-        core, _ = self.inner.updated_pressure(moved)
-        return self.skin.updated_pressure(moved), core, *self.outer.updated_pressure(moved)
+        outer, inner = offsets or (None, None)
+        core, _ = self.inner.updated_pressure(change, inner)
+        skin = self.skin.updated_pressure(vec3s(change))
+        return skin, core, *self.outer.updated_pressure(change, outer)
+
+    def offset_changes(self, change: Floats) -> OffsetChanges:
+        """How a change (n,) of the free unknowns changes the gaps' offsets, to first order."""
+        moved = self._as_field(change)
+        return self.outer.offset_change(moved), self.inner.offset_change(moved)
+
+    def offset_force(self, offsets: OffsetChanges) -> Floats:
+        """Forces by which contact resists changes of the gaps' offsets [N], (n,)."""
+        force = np.zeros_like(self.mesh.nodes)
+        for surface, offset in zip((self.outer, self.inner), offsets, strict=True):
+            surface.add_offset_load(offset, force)
+        return force.reshape(-1)[self.pattern.free]
 
     def misfit_force(self, state: SolutionState) -> Floats:
         """Load on the free unknowns by static condensation of the pressures [N], (n,)."""
@@ -334,6 +355,12 @@ class EquilibriumSystem:
         """
         stretch = state.traction / self.contact.tangential_stiffness
         state.anchor[:] = indenter.to_local(self.outer.points_at(state.position) - stretch)
+
+    def _as_field(self, change: Floats) -> Floats:
+        """A change (n,) of the free unknowns as one of the nodes, (V, 3)."""
+        full = np.zeros_like(self.mesh.nodes)
+        full.reshape(-1)[self.pattern.free] = change
+        return full
 
     def _both(self, first: Callable[[], None], second: Callable[[], None]) -> None:
         """Run two halves at once; Warp launches release the interpreter lock."""
