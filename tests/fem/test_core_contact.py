@@ -316,6 +316,41 @@ def test_a_renewed_spread_follows_a_state_that_has_moved_on(squeeze: Squeeze, de
     assert abs(state.on_indenter.spread - stale).max() > 0.0
 
 
+def test_pressures_and_friction_follow_offsets_that_follow_a_change(squeeze: Squeeze) -> None:
+    """To first order they are what the laws demand where the correction is evaluated again."""
+    pressed = squeeze("sphere_medium", 0.05, drag_m=1e-4, mortar=True)
+    system, state, step = pressed.system, pressed.state, 1e-9
+    here, move = state.position.copy(), np.random.default_rng(5).normal(size=state.position.shape)
+    ends = []
+    for sign in (0.0, 1.0, -1.0):
+        state.position = here + sign * step * move
+        system.correct_contact(state, pressed.press)
+        pressed.settle()
+        gaps = state.on_indenter.gap, state.on_core.gap
+        ends.append((*gaps, state.core_pressure, state.indenter_pressure, state.traction))
+    state.position = here
+    system.correct_contact(state, pressed.press)
+    pressed.settle()
+    system.balance(state, pressed.press)
+    system.tangent_values()
+    assert (system.outer.status.numpy() == 3).any()  # some slide, with the pressure
+    offsets = system.offset_changes(move.ravel())
+    faces = (system.mesh.outer_faces, system.mesh.inner_faces)
+    touching = (state.indenter_pressure > 0.0, state.core_pressure > 0.0)
+    for k, (offset, nodes, those) in enumerate(zip(offsets, faces, touching, strict=True)):
+        wanted = (ends[1][k] - ends[2][k]) / (2 * step)
+        assert np.abs(wanted[those]).max() > 1e-3
+        assert difference(offset[nodes][those], wanted[those]) < 1e-6
+    outer, inner = offsets
+    _, *targets = system.updated_pressures(step * move, (step * outer, step * inner))
+    _, *kept = system.updated_pressures(step * move)
+    for k, (found, without) in enumerate(zip(targets, kept, strict=True), start=2):
+        those = touching[1] if k == 2 else touching[0]
+        now, wanted = ends[0][k][those], ends[1][k][those]
+        assert difference(found[those] - now, wanted - now) < 1e-3
+        assert difference(without[those] - now, wanted - now) > 1e-2
+
+
 def test_sticking_to_a_flat_has_a_symmetric_tangent(squeeze: Squeeze) -> None:
     """So no iterations are spent on its rest."""
     pressed = squeeze("cube", 5.0, drag_m=1e-6)

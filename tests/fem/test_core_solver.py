@@ -185,6 +185,21 @@ def test_nothing_is_deeper_than_micrometres(pressed: Pressed) -> None:
         assert step.convergence.penetration_m == pytest.approx(deepest, abs=0.5e-6)
 
 
+def test_offsets_of_gaps_are_those_of_the_solution(fill: Fill, settled: SolverSettings) -> None:
+    """Not those of an iterate before it: each iteration near the solution evaluates them."""
+    tip = fill(settled)
+    run = tip.load_stepping(BALL, press_path(tip, 1.5e-3, side_m=0.2e-3))
+    run.run()
+    again = run.at.state.copy()
+    tip.system.correct_contact(again, run.at.indenter)
+    for found, wanted in (
+        (run.at.state.on_indenter, again.on_indenter),
+        (run.at.state.on_core, again.on_core),
+    ):
+        assert np.abs(wanted.gap).max() > 1e-6
+        np.testing.assert_array_equal(found.gap, wanted.gap)
+
+
 @pytest.mark.parametrize(
     ("which", "tolerance"), [("pressed", COULOMB), ("exact", 1e-9)], ids=["usual", "exact"]
 )
