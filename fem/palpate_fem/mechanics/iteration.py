@@ -20,8 +20,11 @@ DAMP_FROM = 6
 MORTAR_FROM = 1e-2
 """Error from which on the mortar correction is evaluated again: near enough to the solution."""
 
+RENEWALS = 6
+"""Iterations that evaluate it, one after another; if they do not end, it is kept in between."""
+
 CONTINUED_UPDATES = 2
-"""How often, at most, continuation does so; each time leaves a tenth of its error or less."""
+"""How often, at most, continuation evaluates it; each time leaves a tenth of its error or less."""
 
 HOPELESS = 0.3
 """Error at which Newton's method, after some iterations, gives up; continuation takes over."""
@@ -48,7 +51,7 @@ class NewtonSettings:
         pseudo_transient_iterations: Most iterations of pseudo-transient continuation.
         mortar_updates: How often, at most, the mortar correction of contact, which is first
             evaluated at the start, is evaluated again near the solution: there, and after each
-            iteration from there on.
+            iteration from there on (`RENEWALS`).
         linear_tolerance: Share of a linear solution below which one correction for the unsymmetric
             tangent is enough; else GMRES goes on until a third of this share of it is left over.
         largest_move_m: Displacement of any node in one iteration; longer moves are shortened [m].
@@ -65,7 +68,7 @@ class NewtonSettings:
     iterations: int = 20
     patience: int = 10
     pseudo_transient_iterations: int = field(default=40, metadata={"stored_as": "creep_iterations"})
-    mortar_updates: int = 7
+    mortar_updates: int = 9
     linear_tolerance: float = 0.3
     largest_move_m: float = 0.25e-3
     keep_factor: float = 0.3
@@ -270,7 +273,7 @@ def newton_iterations(
     fits, elastic = False, not (has_elastic and settings.keep_elastic)
     most = min(settings.mortar_updates, CONTINUED_UPDATES if continuation else limit)
     updates, done = 0, 0  # of the mortar correction, and the iterations before it was asked for
-    renews = False
+    renews, renewals = False, 0
     found, error = start, largest_error(start, volume)
     report.residuals.append(error)
     while True:
@@ -279,7 +282,7 @@ def newton_iterations(
             found, changed = cast("Evaluated", (yield Correct()))
             error = largest_error(found, volume)
             updates, done = updates + 1, report.iterations
-            renews = updates < most and not continuation
+            renews = updates < most and renewals < RENEWALS and not continuation
             fits = fits and not changed  # the state hardly moves any more
         if has_converged(found, volume, settings):
             report.converged = True
@@ -300,8 +303,8 @@ def newton_iterations(
             report.reason = failure.problem
             return found
         report.iterations += 1
-        updates += renews
-        renews = renews and updates < most
+        updates, renewals = updates + renews, renewals + renews
+        renews = renews and updates < most and renewals < RENEWALS
         before, error = error, largest_error(found, volume)
         report.residuals.append(error)
         if not np.isfinite(error):
