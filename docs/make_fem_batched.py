@@ -56,8 +56,9 @@ def outcomes(run: dict[str, Any]) -> str:
 
 
 def processes(run: dict[str, Any]) -> str:
-    """How many processes shared the device, and whether by NVIDIA's MPS."""
-    return f"{run.get('together', 1)}{', MPS' if run.get('mps') else ''}"
+    """How many processes shared the device, and what is to be said of the run."""
+    remarks = [name for key, name in (("mps", "MPS"), ("kept", "kept")) if run.get(key)]
+    return ", ".join([str(run.get("together", 1)), *remarks])
 
 
 def times(runs: list[dict[str, Any]]) -> str:

@@ -14,10 +14,11 @@ and its pressure loads the skin where the faces are, as the derivative of g^ say
 
 The forces are evaluated where the faces are (``contact_kernels``); at constant pressures their
 derivative couples the nodes of one face. The rest of the derivative would couple nodes that are two
-faces apart, which the tangent's pattern does not. So Newton's method keeps a *correction* of
-contact at the nodes, evaluated at one state (`NewtonSettings.mortar_updates`): an offset of each
-node's gap, and a matrix by which its linear solutions tell how forces follow the pressures (ADR
-0023).
+faces apart, which the tangent's pattern does not. So contact at the nodes has a *correction*,
+evaluated at the start of an increment and again near its solution
+(`NewtonSettings.mortar_updates`): an offset of each node's gap, and a matrix by which linear
+solutions tell how forces follow the pressures and, transposed, how the offsets follow a change of
+the nodes (ADR 0023).
 """
 
 from __future__ import annotations
