@@ -6,9 +6,8 @@
 
 Presses are the twin's: points of the pad in turn with the nine indenters, one 3 mm deep along the
 normal and one 1.5 mm deep at 30 degrees to it, in 20 steps. ``--check N`` computes N of the first
-mesh on the CPU, too, in ``--processes`` processes. ``--tightened 1000`` divides all tolerances by
-so much, and evaluates mortar corrections eight times instead of twice. Results are written after
-each size. ``docs/make_fem_batched.py`` makes a page of them.
+mesh on the CPU, too, in ``--processes`` processes. ``--tightened 10`` divides all tolerances by
+so much. Results are written after each size. ``docs/make_fem_batched.py`` makes a page of them.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ def fingertip(edge_m: float, tightened: float = 1.0) -> Fingertip:
         gap_tolerance_m=usual.gap_tolerance_m / tightened,
         traction_tolerance=usual.traction_tolerance / tightened,
         iterations=usual.iterations if tightened == 1.0 else 3 * usual.iterations,
-        mortar_updates=usual.mortar_updates if tightened == 1.0 else 8,
+        mortar_updates=usual.mortar_updates if tightened == 1.0 else 30,
     )
     return Fingertip.pressurised(biotac(edge_m=edge_m), None, SolverSettings(newton=newton))
 
