@@ -464,7 +464,7 @@ def pad_point(surface: OuterSurface, x_m: float, y_m: float) -> tuple[Floats, Fl
         ConfigError: The pad does not reach there; names its extent.
     """
     normals = node_normals(surface.nodes, surface.faces)
-    on_skin = np.unique(surface.faces)
+    on_skin = surface.used
     pad = on_skin[normals[on_skin, 2] < _FACES_DOWN]
     away = np.hypot(surface.nodes[pad, 0] - x_m, surface.nodes[pad, 1] - y_m)
     nearest = pad[int(away.argmin())]

@@ -555,8 +555,8 @@ class BatchedEquations:
             surface.set_targets(items, moved)
         if following is None:
             return
+        self._copy(following, 3 * self._nodes, moved, self._product)
         for surface, items in self._mortar_surfaces(following):
-            self._copy(following, 3 * self._nodes, moved, self._product)
             surface.move_along_normals(items, moved, self._product)
             surface.set_targets(items, self._product)
 

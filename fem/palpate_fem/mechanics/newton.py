@@ -151,8 +151,7 @@ class NewtonSolver:
         change, pressure_change, offsets = self._linear_solution(
             state, balance, volume, renews=wanted.renews
         )
-        move = np.zeros_like(state.position)
-        move.reshape(-1)[system.pattern.free] = change
+        move = system.as_field(change)
         if not np.isfinite(change).all():
             raise SimulationError("the linear solve gave no number", remedy="smaller increments")
         longest = float(np.sqrt((move * move).sum(axis=1).max()))
@@ -217,9 +216,8 @@ class NewtonSolver:
             # K^-1 b leaves out the unsymmetric share. The volume is met exactly all the same; the
             # error of the forces is small, as the pressure changes little in a step.
             self._border = (gradient, answer)
-        missing = 0.0 if volume is None else volume - balance.volume
-        sealed = volume is not None
-        change, pressure_change = self._sealed(change, missing) if sealed else (change, 0.0)
+        missing = None if volume is None else volume - balance.volume
+        change, pressure_change = self._sealed(change, missing)
         offsets = None
         if system.is_unsymmetric:
             load = -system.coupled_force()
@@ -227,12 +225,17 @@ class NewtonSolver:
                 offsets = system.offset_changes(change)
                 load -= system.offset_force(offsets)
             more = self._correction(change, load, whole=not renews)
-            more, further = self._sealed(more, 0.0) if sealed else (more, 0.0)
-            change, pressure_change = change + more, pressure_change + further
+            change, further = self._sealed(change + more, missing)
+            pressure_change += further
         return change, pressure_change, offsets
 
-    def _sealed(self, change: Floats, missing_m3: float) -> tuple[Floats, float]:
-        """A change with the fluid pressure by which the cavity gets what it lacks; that, too."""
+    def _sealed(self, change: Floats, missing_m3: float | None) -> tuple[Floats, float]:
+        """A change that also fills the cavity, and the change of the fluid pressure that does so.
+
+        ``missing_m3`` is the volume that the cavity lacks; None = the fluid pressure is given.
+        """
+        if missing_m3 is None:
+            return change, 0.0
         assert self._border is not None
         gradient, answer = self._border
         pressure = (missing_m3 - float(gradient @ change)) / float(gradient @ answer)

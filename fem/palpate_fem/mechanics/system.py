@@ -284,9 +284,15 @@ class EquilibriumSystem:
         """Whether the last tangent has an unsymmetric share."""
         return self.outer.is_unsymmetric or self.inner.is_unsymmetric
 
+    def as_field(self, change: Floats) -> Floats:
+        """A change (n,) of the free unknowns as one of the nodes, (V, 3)."""
+        full = np.zeros_like(self.mesh.nodes)
+        full.reshape(-1)[self.pattern.free] = change
+        return full
+
     def unsymmetric_product(self, change: Floats) -> Floats:
         """(Tangent - its symmetric approximation) times a change of the free unknowns, (n,)."""
-        full = self._as_field(change)
+        full = self.as_field(change)
         product = np.zeros_like(full)
         for surface in (self.outer, self.inner):
             surface.add_unsymmetric_product(vec3s(full), vec3s(product))
@@ -317,7 +323,7 @@ class EquilibriumSystem:
 
     def offset_changes(self, change: Floats) -> OffsetChanges:
         """How a change (n,) of the free unknowns changes the gaps' offsets, to first order."""
-        moved = self._as_field(change)
+        moved = self.as_field(change)
         return self.outer.offset_change(moved), self.inner.offset_change(moved)
 
     def offset_force(self, offsets: OffsetChanges) -> Floats:
@@ -355,12 +361,6 @@ class EquilibriumSystem:
         """
         stretch = state.traction / self.contact.tangential_stiffness
         state.anchor[:] = indenter.to_local(self.outer.points_at(state.position) - stretch)
-
-    def _as_field(self, change: Floats) -> Floats:
-        """A change (n,) of the free unknowns as one of the nodes, (V, 3)."""
-        full = np.zeros_like(self.mesh.nodes)
-        full.reshape(-1)[self.pattern.free] = change
-        return full
 
     def _both(self, first: Callable[[], None], second: Callable[[], None]) -> None:
         """Run two halves at once; Warp launches release the interpreter lock."""

@@ -17,8 +17,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from palpate.errors import ConfigError, PalpateError, SimulationError
 from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.catalogue import make_indenter
@@ -179,7 +177,7 @@ class DeviceWorker:
         from palpate_fem.batched.fingertip import BatchedPress
 
         assert self._skin is not None
-        on_skin = self._skin.nodes[np.unique(self._skin.faces)]
+        on_skin = self._skin.nodes[self._skin.used]
         lowest = on_skin[on_skin[:, 2].argmin()]
         indenter = make_indenter(self._indenters[0])
         with contextlib.suppress(PalpateError):  # a finger of another shape is warmed up by presses
