@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,9 +18,13 @@ from palpate_fem.mechanics.iteration import (
     FIRST_VISCOSITY,
     LEAST_VISCOSITY,
     MOST_VISCOSITY,
+    Correct,
+    Factorise,
     NewtonReport,
     NewtonSettings,
     PseudoTransient,
+    Step,
+    newton_iterations,
 )
 from palpate_fem.mechanics.load_stepping import SolverSettings, moves_in
 from palpate_fem.mechanics.newton import NewtonSolver
@@ -56,6 +62,26 @@ def test_viscosity_rises_from_none_as_far_as_it_may() -> None:
     while continuation.can_rise:
         continuation.rise()
     assert continuation.viscosity == MOST_VISCOSITY
+
+
+@pytest.mark.parametrize("continuation", [None, PseudoTransient()])
+def test_offsets_rest_before_an_increment_ends(continuation: PseudoTransient | None) -> None:
+    # Each evaluation finds the offsets off by a tenth of what the last one did; a step meets them.
+    misfit = 1e-3
+    errors = {"volume": 1.0, "strain_error": 0.0, "gap_error_m": 0.0, "traction_error": 0.0}
+    requests = newton_iterations(
+        report := NewtonReport(), SimpleNamespace(residual=0.5, **errors), None, NewtonSettings(),
+        has_elastic=False, continuation=continuation,
+    )  # fmt: skip
+    wanted = next(requests)
+    while not report.converged:
+        residual = 1e-9
+        if isinstance(wanted, Correct) or (isinstance(wanted, Step) and wanted.renews):
+            residual, misfit = misfit, 0.1 * misfit
+        found: object = (SimpleNamespace(residual=residual, **errors), False)
+        with contextlib.suppress(StopIteration):
+            wanted = requests.send(True if isinstance(wanted, Factorise) else found)
+    assert misfit <= 1e-6
 
 
 def newton_of(

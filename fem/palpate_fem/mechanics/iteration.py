@@ -23,7 +23,7 @@ MORTAR_FROM = 1e-2
 RENEWALS = 6
 """Iterations that evaluate it, one after another; if they do not end, it is kept in between."""
 
-CONTINUED_UPDATES = 2
+CONTINUED_UPDATES = 4
 """How often, at most, continuation evaluates it; each time leaves a tenth of its error or less."""
 
 HOPELESS = 0.3
@@ -68,7 +68,7 @@ class NewtonSettings:
     iterations: int = 20
     patience: int = 10
     pseudo_transient_iterations: int = field(default=40, metadata={"stored_as": "creep_iterations"})
-    mortar_updates: int = 9
+    mortar_updates: int = 12
     linear_tolerance: float = 0.3
     largest_move_m: float = 0.25e-3
     keep_factor: float = 0.3
