@@ -38,6 +38,7 @@ from palpate_training.systems.samples import impedance_ohm
 
 Floats = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.number]
+Rows = npt.NDArray[np.integer]
 
 ELECTRODES = len(ELECTRODE_POSITIONS)
 
@@ -117,6 +118,16 @@ PRESS_VARIANCE_N2 = 0.02
 
 ROW_VARIANCE_N2 = 0.01
 
+SENSITIVITY_VARIANCE = 0.03
+"""Of each entry of the 3 x 3 matrix by which estimates are off, where a finger is far more or less
+sensitive than the others. Not always: on fingers that are alike, slow errors would pass for it."""
+
+LIKELIER = 10.0
+"""Log evidence that labelled presses must give for it over none,"""
+
+CLEARLY_BETTER = 0.8
+"""and share of the error, of each press without itself, that it must leave at most."""
+
 
 @dataclass(frozen=True, slots=True)
 class FingerRecording:
@@ -132,7 +143,7 @@ class FingerRecording:
 
     electrodes: Counts
     baseline: Counts
-    segment: npt.NDArray[np.integer]
+    segment: Rows
     period_s: float
     force: Floats
 
@@ -174,8 +185,8 @@ class LabelledPresses:
         press: Press of each, shape (M,).
     """
 
-    rows: npt.NDArray[np.integer]
-    press: npt.NDArray[np.integer]
+    rows: Rows
+    press: Rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,9 +211,7 @@ class _Scale:
         spread = np.sqrt(np.mean(np.square(spreads), axis=0))
         return cls(np.zeros(len(spread)), spread)
 
-    def apply(
-        self, recording: FingerRecording, inputs: Inputs, rows: npt.NDArray[np.integer]
-    ) -> Floats:
+    def apply(self, recording: FingerRecording, inputs: Inputs, rows: Rows) -> Floats:
         """Inputs of some rows, shape (M, D)."""
         parts = np.hstack([part[rows] for part in recording.parts(inputs)])
         channels = parts.shape[1] // (1 + len(inputs.contexts_s))
@@ -317,39 +326,79 @@ class ForceTransfer:
     ) -> CorrectedForces:
         """Correct estimates by labelled presses of the same finger.
 
+        Where these presses say that the finger is far more or less sensitive than the others, the
+        correction grows with the estimate, too.
+
         Args:
             recording: With the forces of the labelled rows; no others are looked at.
             estimate: Of all its rows [N], shape (N, 3).
             labelled: Which rows.
         """
-        everything = np.arange(len(estimate))
-        rows = self._scale.apply(recording, CORRECTION_INPUTS, everything)
-        known = rows[labelled.rows]
-        error = recording.force[labelled.rows] - estimate[labelled.rows]
-
-        def covariance(some: npt.NDArray[np.integer]) -> Floats:
-            place = CORRECTION_VARIANCE_N2 * CORRECTION(rows[some], known)
-            apart_s = recording.period_s * np.abs(some[:, None] - labelled.rows)
-            together = recording.segment[some][:, None] == recording.segment[labelled.rows]
-            moment = WANDERING_N2 * together * np.exp(-apart_s / WANDERING_S)
-            return np.asarray(OFFSET_VARIANCE_N2 + place + moment)
-
-        same = labelled.press[:, None] == labelled.press
-        inverse = np.linalg.inv(
-            covariance(labelled.rows)
-            + PRESS_VARIANCE_N2 * same
-            + ROW_VARIANCE_N2 * np.eye(len(same))
+        rows = self._scale.apply(recording, CORRECTION_INPUTS, np.arange(len(estimate)))
+        alike, scaled = (
+            _Correction(recording, rows, estimate, labelled, sensitivity)
+            for sensitivity in (0.0, SENSITIVITY_VARIANCE)
         )
-        weight = inverse @ error
-        parts = np.array_split(everything, max(1, len(rows) // 4000))
-        force = estimate + np.vstack([covariance(part) @ weight for part in parts])
+        likelier = scaled.log_evidence - alike.log_evidence > LIKELIER
+        several = labelled.press.min() != labelled.press.max()
+        better = not several or scaled.held_out_error < CLEARLY_BETTER * alike.held_out_error
+        chosen = scaled if likelier and better else alike
+        return CorrectedForces(chosen.force(), chosen.held_out)
+
+
+class _Correction:
+    """A Gaussian process of the error of estimates, known at labelled rows.
+
+    Attributes:
+        held_out: Corrected estimates of the labelled rows, each without its own press, (M, 3).
+        held_out_error: Their error in the median [N].
+        log_evidence: Logarithm of the probability density of the labelled errors.
+    """
+
+    def __init__(
+        self,
+        recording: FingerRecording,
+        rows: Floats,
+        estimate: Floats,
+        labelled: LabelledPresses,
+        sensitivity: float,
+    ) -> None:
+        self._recording, self._rows, self._estimate = recording, rows, estimate
+        self._labelled, self._sensitivity = labelled, sensitivity
+        known = recording.force[labelled.rows]
+        error = known - estimate[labelled.rows]
+        same = labelled.press[:, None] == labelled.press
+        covariance = self._covariance(labelled.rows) + PRESS_VARIANCE_N2 * same
+        covariance[np.diag_indices(len(same))] += ROW_VARIANCE_N2
+        inverse = np.linalg.inv(covariance)
+        self._weight = inverse @ error
         # What is left of a press when it is left out follows from the inverse alone.
-        held_out = np.empty_like(error)
+        left = np.empty_like(error)
         for press in np.unique(labelled.press):
             own = labelled.press == press
-            left = np.linalg.solve(inverse[np.ix_(own, own)], weight[own])
-            held_out[own] = recording.force[labelled.rows[own]] - left
-        return CorrectedForces(force, held_out)
+            left[own] = np.linalg.solve(inverse[np.ix_(own, own)], self._weight[own])
+        self.held_out = known - left
+        self.held_out_error = float(np.median(np.linalg.norm(left, axis=1)))
+        _, log_determinant = np.linalg.slogdet(covariance)
+        fit = float(np.sum(error * self._weight))
+        self.log_evidence = -0.5 * (fit + error.shape[1] * log_determinant)
+
+    def force(self) -> Floats:
+        """Corrected estimates of all rows [N], shape (N, 3)."""
+        everything = np.arange(len(self._estimate))
+        parts = np.array_split(everything, max(1, len(everything) // 4000))
+        change = [self._covariance(part) @ self._weight for part in parts]
+        return np.asarray(self._estimate + np.vstack(change))
+
+    def _covariance(self, some: Rows) -> Floats:
+        """Of the errors of some rows with those of the labelled ones, shape (N, M)."""
+        recording, labelled = self._recording, self._labelled.rows
+        place = CORRECTION_VARIANCE_N2 * CORRECTION(self._rows[some], self._rows[labelled])
+        apart_s = recording.period_s * np.abs(some[:, None] - labelled)
+        together = recording.segment[some][:, None] == recording.segment[labelled]
+        moment = WANDERING_N2 * together * np.exp(-apart_s / WANDERING_S)
+        scale = self._sensitivity * (self._estimate[some] @ self._estimate[labelled].T)
+        return np.asarray(OFFSET_VARIANCE_N2 + place + moment + scale)
 
 
 def _mean_direction(forces: Sequence[Floats]) -> Floats:
