@@ -42,16 +42,23 @@ def pattern(force: Floats) -> Floats:
     return np.asarray(np.tanh(force @ weight))
 
 
-def invented(seed: int, *, conductivity: float = 0.0, name: str = "") -> FeatureDataset:
+def invented(
+    seed: int,
+    *,
+    conductivity: float = 0.0,
+    sensitivity: float = 1.0,
+    rest: tuple[float, float] = (2400.0, 3000.0),
+    name: str = "",
+) -> FeatureDataset:
     """A finger in ordinary use; ``conductivity`` shifts all its logarithms since the tare."""
     random = np.random.default_rng(seed)
     steps = random.normal(size=(ROWS, 3)).cumsum(axis=0)
     steps -= np.linspace(0.0, 1.0, ROWS)[:, None] * steps[-1]
     force = np.array([0.0, 0.0, 4.0]) + np.array([1.0, 0.7, 1.2]) * steps / steps.std(axis=0)
     force[:, 2] = np.maximum(force[:, 2], 0.5)
-    baseline = random.uniform(2400.0, 3000.0, 19)
+    baseline = random.uniform(*rest, 19)
     ratio = 4095.0 / baseline - 1.0
-    logs = pattern(force) + random.normal(0.0, 0.002, (ROWS, 19)) + conductivity
+    logs = sensitivity * pattern(force) + random.normal(0.0, 0.002, (ROWS, 19)) + conductivity
     counts = np.clip(np.rint(4095.0 / (1.0 + ratio * np.exp(logs))), 0, 4095)
     return FeatureDataset(
         electrodes=counts.astype(np.uint16),
@@ -201,6 +208,44 @@ def test_a_held_out_press_is_estimated_as_if_it_had_not_been_labelled(
     others = press != 1
     without = model.correct(one, estimate, LabelledPresses(rows[others], press[others]))
     np.testing.assert_allclose(whole.held_out[~others], without.force[rows[~others]], atol=1e-8)
+
+
+def test_presses_tell_that_a_finger_is_more_sensitive(model: ForceTransfer) -> None:
+    sensitive = fingers_of(invented(2, sensitivity=4.0))[0]
+    results = {
+        shots: run_transfer([finger(1)], sensitive, shots=shots, draws=3) for shots in (0, 5)
+    }
+    constant = results[5]["constant"]["magnitude_median_n"]
+    assert results[0]["magnitude_median_n"] > 2.0 * constant
+    assert results[5]["magnitude_median_n"] < 0.5 * constant
+
+
+def test_presses_of_a_finger_like_the_others_do_not_change_its_scale(
+    model: ForceTransfer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = finger(2).recording
+    estimate = model.estimate(one, unlabelled=False)
+    rows = np.arange(0, ROWS, 10)
+    labelled = LabelledPresses(rows, rows // 200)
+    found = model.correct(one, estimate, labelled)
+    monkeypatch.setattr(transfer, "SENSITIVITY_VARIANCE", 0.0)
+    np.testing.assert_array_equal(found.force, model.correct(one, estimate, labelled).force)
+
+
+def test_without_a_press_an_unlike_finger_is_estimated_no_worse_than_by_a_constant() -> None:
+    """Its skin lies near the core: four times the impedance, and as much more sensitive."""
+    unlike = fingers_of(invented(2, sensitivity=4.0, rest=(1000.0, 1600.0)))[0]
+    result = run_transfer([finger(1), finger(3)], unlike)
+    assert result["unlike"]
+    assert 3.0 < result["impedance_ratio"] < 6.0
+    # The constant is a mean over other rows of the same fingers.
+    assert result["magnitude_median_n"] <= 1.2 * result["constant"]["magnitude_median_n"]
+    assert result["angle_median_rad"] < result["constant"]["angle_median_rad"]
+    assert result["coverage_90"] > 0.8
+    assert not run_transfer([finger(1)], finger(2))["unlike"]
+    # With a finger of its kind among the others it is one of them.
+    of_its_kind = fingers_of(invented(4, sensitivity=4.0, rest=(1000.0, 1600.0)))[0]
+    assert not run_transfer([finger(1), of_its_kind], unlike)["unlike"]
 
 
 def test_what_cannot_be_tested_is_refused() -> None:

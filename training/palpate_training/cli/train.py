@@ -310,6 +310,12 @@ def train_transfer(
             f"90 % intervals: half width {result['interval_median_n']:.2f} N,"
             f" hold {100 * result['coverage_90']:.0f} % of the true magnitudes"
         )
+        if result["unlike"]:
+            console.print(
+                f"{result['test']} is unlike the others: untouched, its impedance is"
+                f" {result['impedance_ratio']:.2g} times that of the nearest one. Only labelled"
+                " presses tell how sensitive it is: --shots 5 or more"
+            )
 
 
 def train_features_command(

@@ -148,7 +148,10 @@ def run_transfer(
         ``magnitude_median_n``, ``magnitude_p95_n``, ``angle_median_rad``, ``coverage_90`` (share of
         the true magnitudes inside their 90 % intervals), ``interval_median_n`` (half its width),
         and in ``constant`` and ``ridge`` the first three of a constant and of a ridge regression
-        that know the same forces; which finger, how many presses, draws and tested rows.
+        that know the same forces; which finger, how many presses, draws and tested rows;
+        ``impedance_ratio``, the finger's untouched impedance over that of the nearest one trained
+        on, and ``unlike``, whether it is so far from 1 that nothing tells how sensitive this finger
+        is (`ALIKE`). Then, without a press, every magnitude is that of the others' mean force.
 
     Raises:
         DatasetError: The tested finger is among the others, or has too few presses.
@@ -171,6 +174,11 @@ def run_transfer(
     model = ForceTransfer(sources, line)
     on_step()
     plain = model.estimate(test.recording, unlabelled=unlabelled)
+    unlike = not model.knows_like(test.recording)
+    if unlike and not shots:
+        plain = model.typical(plain)
+        known = np.vstack([source.force for source in sources])
+        width = _width(model.typical(known), known)
     on_step()
     found: dict[str, list[dict[str, float]]] = {"": [], "constant": [], "ridge": []}
     for _ in range(draws if shots else 1):
@@ -210,6 +218,8 @@ def run_transfer(
         "seed": seed,
         "twin": line is not None,
         "rows": len(test.recording.force),
+        "impedance_ratio": model.impedance_ratio(test.recording),
+        "unlike": unlike,
     }
 
 

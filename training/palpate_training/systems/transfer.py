@@ -129,6 +129,11 @@ CLEARLY_BETTER = 0.8
 """and share of the error, of each press without itself, that it must leave at most."""
 
 
+ALIKE = 2.0
+"""Mean impedance at rest of a finger over that of another one, up to which they are taken for
+alike. Skin nearer to the core makes a finger more sensitive, and its impedance larger."""
+
+
 @dataclass(frozen=True, slots=True)
 class FingerRecording:
     """Rows of one finger in order of time.
@@ -153,6 +158,10 @@ class FingerRecording:
         values -= (1.0 - inputs.common) * values.mean(axis=1, keepdims=True)
         means = (self._moving_mean(values, context_s) for context_s in inputs.contexts_s)
         return [values, *(values - mean for mean in means)]
+
+    def rest_log(self) -> float:
+        """Logarithm of the untouched impedance [ohm], mean over electrodes and rows."""
+        return float(np.log(impedance_ohm(self.baseline)).mean())
 
     def mirrored(self) -> FingerRecording:
         """What the finger would have read, had all been its mirror image."""
@@ -320,6 +329,24 @@ class ForceTransfer:
             direction = _unit(direction)
         lengths = [np.linalg.norm(process(recording), axis=1) for process in self._magnitude]
         return np.asarray(np.mean(lengths, axis=0)[:, None] * direction)
+
+    def impedance_ratio(self, recording: FingerRecording) -> float:
+        """Untouched impedance over that of the training finger that is nearest in it."""
+        apart = [recording.rest_log() - source.rest_log() for source in self._sources]
+        return float(np.exp(min(apart, key=abs)))
+
+    def knows_like(self, recording: FingerRecording) -> bool:
+        """Whether a training finger's untouched impedance is like that of a recording (`ALIKE`)."""
+        return 1.0 / ALIKE <= self.impedance_ratio(recording) <= ALIKE
+
+    def typical(self, estimate: Floats) -> Floats:
+        """Estimates with the magnitude of the training fingers' mean force, shape (N, 3).
+
+        For a finger that is unlike all of them, whose sensitivity nobody knows: what the electrodes
+        say of the direction holds, what they say of the magnitude does not.
+        """
+        forces = np.vstack([source.force for source in self._sources])
+        return float(np.linalg.norm(forces.mean(axis=0))) * _unit(estimate)
 
     def correct(
         self, recording: FingerRecording, estimate: Floats, labelled: LabelledPresses
