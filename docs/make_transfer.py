@@ -250,10 +250,12 @@ The constants were chosen on these two fingers. So the method was tried between 
 simulated ones ([commands](../make_transfer_simulated.py)), each with a skin, fill and electrodes of
 its own, pressed {report["presses"]} times and drifting as real ones do: each tested after each
 other one alone was learned from. *Unlike*: untouched, the impedance of one is more than twice that
-of the other. Then, without a press, the magnitude is that of the other's mean force, as nothing
-tells how sensitive the finger is. With presses, leaving each out in its turn tells whether the
+of the other. Then, without a press, the estimate is the other's mean force, as nothing tells
+how sensitive the finger is. With presses, leaving each out in its turn tells whether the
 scale of the estimates is wrong, too. Both rules were found on the pairs that were *looked at*
-(training/LOG.md); they change nothing on the two real fingers.
+(training/LOG.md); they change nothing on the two real fingers. Without a press a simulated
+finger can mislead by newtons, alike at rest or not, and its direction is no better than the ridge
+regression's: fingers of one maker differ less than these, but nobody knows before five presses.
 
 {markdown_table(head, rows)}"""
 

@@ -151,7 +151,7 @@ def run_transfer(
         that know the same forces; which finger, how many presses, draws and tested rows;
         ``impedance_ratio``, the finger's untouched impedance over that of the nearest one trained
         on, and ``unlike``, whether it is so far from 1 that nothing tells how sensitive this finger
-        is (`ALIKE`). Then, without a press, every magnitude is that of the others' mean force.
+        is (`ALIKE`). Then, without a press, every estimate is the others' mean force.
 
     Raises:
         DatasetError: The tested finger is among the others, or has too few presses.
@@ -176,9 +176,9 @@ def run_transfer(
     plain = model.estimate(test.recording, unlabelled=unlabelled)
     unlike = not model.knows_like(test.recording)
     if unlike and not shots:
-        plain = model.typical(plain)
+        plain = np.tile(model.mean_force(), (len(plain), 1))
         known = np.vstack([source.force for source in sources])
-        width = _width(model.typical(known), known)
+        width = _width(np.tile(model.mean_force(), (len(known), 1)), known)
     on_step()
     found: dict[str, list[dict[str, float]]] = {"": [], "constant": [], "ridge": []}
     for _ in range(draws if shots else 1):

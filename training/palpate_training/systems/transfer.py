@@ -339,14 +339,13 @@ class ForceTransfer:
         """Whether a training finger's untouched impedance is like that of a recording (`ALIKE`)."""
         return 1.0 / ALIKE <= self.impedance_ratio(recording) <= ALIKE
 
-    def typical(self, estimate: Floats) -> Floats:
-        """Estimates with the magnitude of the training fingers' mean force, shape (N, 3).
+    def mean_force(self) -> Floats:
+        """Of the training fingers [N], shape (3,): all that is known of one that is unlike them.
 
-        For a finger that is unlike all of them, whose sensitivity nobody knows: what the electrodes
-        say of the direction holds, what they say of the magnitude does not.
+        A finger that is far less sensitive shows its drift where others show forces, and one that
+        is far more sensitive seems pressed hard all the time.
         """
-        forces = np.vstack([source.force for source in self._sources])
-        return float(np.linalg.norm(forces.mean(axis=0))) * _unit(estimate)
+        return np.asarray(np.vstack([source.force for source in self._sources]).mean(axis=0))
 
     def correct(
         self, recording: FingerRecording, estimate: Floats, labelled: LabelledPresses
