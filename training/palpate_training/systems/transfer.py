@@ -10,14 +10,16 @@ over a few such processes, none of them chosen alone.
 From a finger's electrodes *without* forces comes more about the direction: a recording's mean and
 spread, electrode by electrode, take the place of the other fingers'. From a few *labelled* presses
 comes a correction that reaches as far as what was pressed, by the common mode, too, and of all that
-lies some seconds before and after them, as baselines wander.
+lies some seconds before and after them, as baselines wander. Where these presses say that the
+finger is far more or less sensitive than the others, the correction grows with the estimate, too.
 
 The magnitude's processes start from a line through the presses of a simulated population, mapped to
 real fingers by what was learned on the others (``TwinLine``); what they learn is what that line
 leaves. A network of the population helped in no way that was tried (training/LOG.md).
 
 All constants were chosen on the two fingers of the LASA force calibration, in both directions, the
-worse counting, and then frozen (training/LOG.md).
+worse counting, and then frozen; those for fingers that are unlike the others, on four simulated
+ones, too (training/LOG.md).
 """
 
 from __future__ import annotations
@@ -123,11 +125,11 @@ SENSITIVITY_VARIANCE = 0.03
 sensitive than the others. Not always: on fingers that are alike, slow errors would pass for it."""
 
 LIKELIER = 10.0
-"""Log evidence that labelled presses must give for it over none,"""
+"""Log evidence that labelled presses must give for such a matrix over none."""
 
 CLEARLY_BETTER = 0.8
-"""and share of the error, of each press without itself, that it must leave at most."""
-
+"""Where several presses are labelled: share that it must leave, at most, of their error when each
+is estimated without itself."""
 
 ALIKE = 2.0
 """Mean impedance at rest of a finger over that of another one, up to which they are taken for
