@@ -228,7 +228,7 @@ def test_presses_of_a_finger_like_the_others_do_not_change_its_scale(
     rows = np.arange(0, ROWS, 10)
     labelled = LabelledPresses(rows, rows // 200)
     found = model.correct(one, estimate, labelled)
-    monkeypatch.setattr(transfer, "SENSITIVITY_VARIANCE", 0.0)
+    monkeypatch.setattr(transfer, "LIKELIER", np.inf)
     np.testing.assert_array_equal(found.force, model.correct(one, estimate, labelled).force)
 
 

@@ -314,7 +314,7 @@ def train_transfer(
             console.print(
                 f"{result['test']} is unlike the others: untouched, its impedance is"
                 f" {result['impedance_ratio']:.2g} times that of the nearest one. Only labelled"
-                " presses tell how sensitive it is: --shots 5 or more"
+                " presses tell how sensitive it is: --shots 1 or more"
             )
 
 

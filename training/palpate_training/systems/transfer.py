@@ -11,7 +11,7 @@ From a finger's electrodes *without* forces comes more about the direction: a re
 spread, electrode by electrode, take the place of the other fingers'. From a few *labelled* presses
 comes a correction that reaches as far as what was pressed, by the common mode, too, and of all that
 lies some seconds before and after them, as baselines wander. Where these presses say that the
-finger is far more or less sensitive than the others, the correction grows with the estimate, too.
+finger is far more or less sensitive than the others, its estimates are scaled first.
 
 The magnitude's processes start from a line through the presses of a simulated population, mapped to
 real fingers by what was learned on the others (``TwinLine``); what they learn is what that line
@@ -120,12 +120,13 @@ PRESS_VARIANCE_N2 = 0.02
 
 ROW_VARIANCE_N2 = 0.01
 
-SENSITIVITY_VARIANCE = 0.03
-"""Of each entry of the 3 x 3 matrix by which estimates are off, where a finger is far more or less
-sensitive than the others. Not always: on fingers that are alike, slow errors would pass for it."""
+SCALE_VARIANCE, LEAST_SCALE = 1.0, 0.05
+"""Of the factor by which estimates are scaled where a finger is far more or less sensitive than the
+others (its mean is 1), and the least that it may be. Not always: on fingers that are alike, slow
+errors would pass for it."""
 
 LIKELIER = 10.0
-"""Log evidence that labelled presses must give for such a matrix over none."""
+"""By how much more the log evidence of the labelled presses must be with such a factor."""
 
 CLEARLY_BETTER = 0.8
 """Where several presses are labelled: share that it must leave, at most, of their error when each
@@ -198,6 +199,10 @@ class LabelledPresses:
 
     rows: Rows
     press: Rows
+
+    def where(self, kept: npt.NDArray[np.bool_]) -> LabelledPresses:
+        """Some of the rows."""
+        return LabelledPresses(self.rows[kept], self.press[kept])
 
 
 @dataclass(frozen=True, slots=True)
@@ -355,7 +360,7 @@ class ForceTransfer:
         """Correct estimates by labelled presses of the same finger.
 
         Where these presses say that the finger is far more or less sensitive than the others, the
-        correction grows with the estimate, too.
+        estimates are scaled first.
 
         Args:
             recording: With the forces of the labelled rows; no others are looked at.
@@ -363,60 +368,77 @@ class ForceTransfer:
             labelled: Which rows.
         """
         rows = self._scale.apply(recording, CORRECTION_INPUTS, np.arange(len(estimate)))
-        alike, scaled = (
-            _Correction(recording, rows, estimate, labelled, sensitivity)
-            for sensitivity in (0.0, SENSITIVITY_VARIANCE)
-        )
-        likelier = scaled.log_evidence - alike.log_evidence > LIKELIER
-        several = labelled.press.min() != labelled.press.max()
-        better = not several or scaled.held_out_error < CLEARLY_BETTER * alike.held_out_error
-        chosen = scaled if likelier and better else alike
-        return CorrectedForces(chosen.force(), chosen.held_out)
+
+        def scaled_by(presses: LabelledPresses) -> _Correction:
+            scale = _Correction(recording, rows, estimate, presses).scale()
+            return _Correction(recording, rows, scale * estimate, presses)
+
+        alike = _Correction(recording, rows, estimate, labelled)
+        everything, held_out = np.arange(len(estimate)), alike.held_out()
+        scaled = scaled_by(labelled)
+        if scaled.log_evidence - alike.log_evidence <= LIKELIER:
+            return CorrectedForces(alike.force(everything), held_out)
+        presses = np.unique(labelled.press)
+        if len(presses) > 1:
+            known, without = recording.force[labelled.rows], np.empty_like(held_out)
+            for press in presses:
+                own = labelled.press == press
+                without[own] = scaled_by(labelled.where(~own)).force(labelled.rows[own])
+            error, before = (
+                np.median(np.linalg.norm(known - each, axis=1)) for each in (without, held_out)
+            )
+            if error >= CLEARLY_BETTER * before:
+                return CorrectedForces(alike.force(everything), held_out)
+            held_out = without
+        return CorrectedForces(scaled.force(everything), held_out)
 
 
 class _Correction:
     """A Gaussian process of the error of estimates, known at labelled rows.
 
     Attributes:
-        held_out: Corrected estimates of the labelled rows, each without its own press, (M, 3).
-        held_out_error: Their error in the median [N].
         log_evidence: Logarithm of the probability density of the labelled errors.
     """
 
     def __init__(
-        self,
-        recording: FingerRecording,
-        rows: Floats,
-        estimate: Floats,
-        labelled: LabelledPresses,
-        sensitivity: float,
+        self, recording: FingerRecording, rows: Floats, estimate: Floats, labelled: LabelledPresses
     ) -> None:
         self._recording, self._rows, self._estimate = recording, rows, estimate
-        self._labelled, self._sensitivity = labelled, sensitivity
-        known = recording.force[labelled.rows]
-        error = known - estimate[labelled.rows]
+        self._labelled = labelled
+        error = recording.force[labelled.rows] - estimate[labelled.rows]
         same = labelled.press[:, None] == labelled.press
         covariance = self._covariance(labelled.rows) + PRESS_VARIANCE_N2 * same
         covariance[np.diag_indices(len(same))] += ROW_VARIANCE_N2
-        inverse = np.linalg.inv(covariance)
-        self._weight = inverse @ error
-        # What is left of a press when it is left out follows from the inverse alone.
-        left = np.empty_like(error)
-        for press in np.unique(labelled.press):
-            own = labelled.press == press
-            left[own] = np.linalg.solve(inverse[np.ix_(own, own)], self._weight[own])
-        self.held_out = known - left
-        self.held_out_error = float(np.median(np.linalg.norm(left, axis=1)))
+        self._inverse = np.linalg.inv(covariance)
+        self._weight = self._inverse @ error
         _, log_determinant = np.linalg.slogdet(covariance)
         fit = float(np.sum(error * self._weight))
         self.log_evidence = -0.5 * (fit + error.shape[1] * log_determinant)
 
-    def force(self) -> Floats:
-        """Corrected estimates of all rows [N], shape (N, 3)."""
-        everything = np.arange(len(self._estimate))
-        parts = np.array_split(everything, max(1, len(everything) // 4000))
+    def force(self, some: Rows) -> Floats:
+        """Corrected estimates of some rows [N], shape (N, 3)."""
+        parts = np.array_split(some, max(1, len(some) // 4000))
         change = [self._covariance(part) @ self._weight for part in parts]
-        return np.asarray(self._estimate + np.vstack(change))
+        return np.asarray(self._estimate[some] + np.vstack(change))
+
+    def held_out(self) -> Floats:
+        """Corrected estimates of the labelled rows, each without its own press, shape (M, 3)."""
+        held_out = self._recording.force[self._labelled.rows].astype(np.float64)
+        # What is left of a press when it is left out follows from the inverse alone.
+        for press in np.unique(self._labelled.press):
+            own = self._labelled.press == press
+            held_out[own] -= np.linalg.solve(self._inverse[np.ix_(own, own)], self._weight[own])
+        return held_out
+
+    def scale(self) -> float:
+        """The factor of the estimates that the labelled rows make likeliest, `LEAST_SCALE` or more.
+
+        By generalised least squares with what is believed before: 1, with `SCALE_VARIANCE`.
+        """
+        estimate = self._estimate[self._labelled.rows]
+        information = float(np.sum(estimate * (self._inverse @ estimate)))
+        change = float(np.sum(estimate * self._weight)) / (information + 1.0 / SCALE_VARIANCE)
+        return max(LEAST_SCALE, 1.0 + change)
 
     def _covariance(self, some: Rows) -> Floats:
         """Of the errors of some rows with those of the labelled ones, shape (N, M)."""
@@ -425,8 +447,7 @@ class _Correction:
         apart_s = recording.period_s * np.abs(some[:, None] - labelled)
         together = recording.segment[some][:, None] == recording.segment[labelled]
         moment = WANDERING_N2 * together * np.exp(-apart_s / WANDERING_S)
-        scale = self._sensitivity * (self._estimate[some] @ self._estimate[labelled].T)
-        return np.asarray(OFFSET_VARIANCE_N2 + place + moment + scale)
+        return np.asarray(OFFSET_VARIANCE_N2 + place + moment)
 
 
 def _mean_direction(forces: Sequence[Floats]) -> Floats:
