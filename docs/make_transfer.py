@@ -250,14 +250,14 @@ The constants were chosen on these two fingers. So the method was tried between 
 simulated ones ([commands](../make_transfer_simulated.py)), each with a skin, fill and electrodes of
 its own, pressed {report["presses"]} times and drifting as real ones do: each tested after each
 other one alone was learned from. *Unlike*: untouched, the impedance of one is more than twice that
-of the other. Then, without a press, the estimate is the other's mean force, as nothing tells
-how sensitive the finger is. With presses, leaving each out in its turn tells whether the
-scale of the estimates is wrong, too. When that is so was found on the pairs that were *looked at*;
-that the scale is one number, on 14 pairs of all (training/LOG.md). Neither changes anything on the
-two real fingers. Without a press a simulated
-finger can mislead by newtons, alike at rest or not, and its direction is no better than the ridge
-regression's: fingers of one maker differ less than these, but nobody knows before a press. With one or more no
-pair is worse than the constant, and directions are as good as the ridge regression's.
+of the other. Then, without a press, the estimate is the other's mean force, as nothing tells how
+sensitive the finger is. With presses, leaving each out in its turn tells whether the scale of the
+estimates is wrong, too. When that is so was found on the pairs that were *looked at*; that the
+scale is one number, on 14 pairs of all (training/LOG.md). Neither changes anything on the two real
+fingers, which differ less.
+
+Without a press a simulated finger can mislead by newtons, alike at rest or not. With one press or
+more no pair is worse than the constant, and directions are as good as the ridge regression's.
 
 {markdown_table(head, rows)}"""
 
