@@ -234,7 +234,8 @@ depth or 32 N** (the goal is 98 %). Angled presses end with forces that are
 
 ![{draw_stiffening(curves, DATA / "stiffening.png")}](fem/stiffening.png)
 
-The trajectories that neo-Hooke's skin does not bear (with 0.006 and 0.01 they alone were run):
+The trajectories that neo-Hooke's skin does not bear (with 0.006 and 0.01 only those
+were run that it did not bear in an earlier campaign, so some are missing):
 
 """
         + table(

@@ -5,7 +5,7 @@ each from the other: with nothing but a tare, with its electrodes without forces
 labelled presses of 2 s. Then nothing but a tare again, on electrodes that were changed as another
 finger or another day changes them. Then each from its own first seconds, as
 ``palpate calibrate`` learns; at last the end of each from what comes before. Numbers only are
-written, no rows.
+written, no rows. What the page says of simulated fingers is of ``make_transfer_simulated.py``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.ingest import ingest_lasa
 from palpate_training.evaluation.transfer import (
     FIGURES,
@@ -35,6 +34,7 @@ from palpate_training.evaluation.transfer import (
 from palpate_training.figures.style import markdown_table, new_figure, save
 from palpate_training.learning.force_process import ForceLine
 from palpate_training.learning.twin_line import read_line
+from palpate_training.systems.samples import counts_at, impedance_ohm
 from palpate_training.systems.transfer import ForceTransfer
 from palpate_training.tasks.finger import ROWS_MOST, estimate_of, fit_finger
 
@@ -53,10 +53,8 @@ RIVALS = ("ridge", "constant")
 def changed(finger: Finger, change: Callable[[Floats], Floats]) -> Finger:
     """The finger with other logarithms of the impedance over that at rest, (N, 19)."""
     recording = finger.recording
-    rest = COUNTS_MAX / recording.baseline.astype(np.float64) - 1.0
-    inside = np.clip(recording.electrodes, 1, COUNTS_MAX - 1)
-    logs = change(np.log((COUNTS_MAX / inside - 1.0) / rest))
-    counts = np.clip(COUNTS_MAX / (1.0 + rest * np.exp(logs)), 0, COUNTS_MAX)
+    rest = impedance_ohm(recording.baseline)
+    counts = counts_at(rest * np.exp(change(np.log(impedance_ohm(recording.electrodes) / rest))))
     tared = (counts - recording.baseline).astype(np.float32)
     return replace(finger, recording=replace(recording, electrodes=counts), tared=tared)
 

@@ -30,7 +30,7 @@ from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.features import FeatureDataset, open_dataset
 from palpate_training.evaluation.transfer import FIGURES, Finger, fingers_of, run_transfer
 from palpate_training.learning.twin_line import read_line
-from palpate_training.systems.samples import LOAD_OHM, impedance_ohm
+from palpate_training.systems.samples import counts_at, impedance_ohm
 
 OUT = Path(__file__).resolve().parent / "results" / "transfer-simulated.json"
 CONSOLE = Console(width=120)
@@ -103,7 +103,7 @@ def recording_of(data: FeatureDataset, sensor: int, random: np.random.Generator)
     rows = len(force)
     log += drift(random, rows, COMMON, COMMON_S)[:, None]
     log += np.stack([drift(random, rows, EACH, EACH_S) for _ in range(19)], axis=1)
-    counts = COUNTS_MAX / (1.0 + np.exp(log) * impedance_ohm(rest) / LOAD_OHM)
+    counts = counts_at(np.exp(log) * impedance_ohm(rest))
     counts = np.rint(counts + random.normal(0.0, NOISE_COUNTS, counts.shape))
     (finger,) = fingers_of(
         FeatureDataset(

@@ -26,6 +26,7 @@ from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.metrics import force_errors
 from palpate_training.learning.twin_line import TwinLine
 from palpate_training.systems.transfer import (
+    ALIKE,
     FingerRecording,
     ForceTransfer,
     LabelledPresses,
@@ -174,11 +175,12 @@ def run_transfer(
     model = ForceTransfer(sources, line)
     on_step()
     plain = model.estimate(test.recording, unlabelled=unlabelled)
-    unlike = not model.knows_like(test.recording)
+    ratio = model.impedance_ratio(test.recording)
+    unlike = not 1.0 / ALIKE <= ratio <= ALIKE
     if unlike and not shots:
-        plain = np.tile(model.mean_force(), (len(plain), 1))
-        known = np.vstack([source.force for source in sources])
-        width = _width(np.tile(model.mean_force(), (len(known), 1)), known)
+        known, mean = np.vstack([source.force for source in sources]), model.mean_force()
+        plain = np.broadcast_to(mean, plain.shape)
+        width = _width(np.broadcast_to(mean, known.shape), known)
     on_step()
     found: dict[str, list[dict[str, float]]] = {"": [], "constant": [], "ridge": []}
     for _ in range(draws if shots else 1):
@@ -218,7 +220,7 @@ def run_transfer(
         "seed": seed,
         "twin": line is not None,
         "rows": len(test.recording.force),
-        "impedance_ratio": model.impedance_ratio(test.recording),
+        "impedance_ratio": ratio,
         "unlike": unlike,
     }
 

@@ -342,10 +342,6 @@ class ForceTransfer:
         apart = [recording.rest_log() - source.rest_log() for source in self._sources]
         return float(np.exp(min(apart, key=abs)))
 
-    def knows_like(self, recording: FingerRecording) -> bool:
-        """Whether a training finger's untouched impedance is like that of a recording (`ALIKE`)."""
-        return 1.0 / ALIKE <= self.impedance_ratio(recording) <= ALIKE
-
     def mean_force(self) -> Floats:
         """Of the training fingers [N], shape (3,): all that is known of one that is unlike them.
 
@@ -368,77 +364,78 @@ class ForceTransfer:
             labelled: Which rows.
         """
         rows = self._scale.apply(recording, CORRECTION_INPUTS, np.arange(len(estimate)))
-
-        def scaled_by(presses: LabelledPresses) -> _Correction:
-            scale = _Correction(recording, rows, estimate, presses).scale()
-            return _Correction(recording, rows, scale * estimate, presses)
-
-        alike = _Correction(recording, rows, estimate, labelled)
-        everything, held_out = np.arange(len(estimate)), alike.held_out()
-        scaled = scaled_by(labelled)
-        if scaled.log_evidence - alike.log_evidence <= LIKELIER:
-            return CorrectedForces(alike.force(everything), held_out)
+        process = _ErrorProcess(recording, rows, labelled)
+        held_out = process.held_out(estimate)
+        scaled = process.scale(estimate) * estimate
+        # Log evidences differ by the misfits alone: the covariance is the same.
+        if 0.5 * (process.misfit(estimate) - process.misfit(scaled)) <= LIKELIER:
+            return CorrectedForces(process.force(estimate), held_out)
         presses = np.unique(labelled.press)
         if len(presses) > 1:
             known, without = recording.force[labelled.rows], np.empty_like(held_out)
             for press in presses:
                 own = labelled.press == press
-                without[own] = scaled_by(labelled.where(~own)).force(labelled.rows[own])
+                others = _ErrorProcess(recording, rows, labelled.where(~own))
+                so_scaled = others.scale(estimate) * estimate
+                without[own] = others.force(so_scaled, labelled.rows[own])
             error, before = (
                 np.median(np.linalg.norm(known - each, axis=1)) for each in (without, held_out)
             )
             if error >= CLEARLY_BETTER * before:
-                return CorrectedForces(alike.force(everything), held_out)
+                return CorrectedForces(process.force(estimate), held_out)
             held_out = without
-        return CorrectedForces(scaled.force(everything), held_out)
+        return CorrectedForces(process.force(scaled), held_out)
 
 
-class _Correction:
-    """A Gaussian process of the error of estimates, known at labelled rows.
+class _ErrorProcess:
+    """A Gaussian process of the error of estimates, which is known at labelled rows.
 
-    Attributes:
-        log_evidence: Logarithm of the probability density of the labelled errors.
+    Estimates are of all rows of the recording, shape (N, 3); the labelled ones are M.
     """
 
-    def __init__(
-        self, recording: FingerRecording, rows: Floats, estimate: Floats, labelled: LabelledPresses
-    ) -> None:
-        self._recording, self._rows, self._estimate = recording, rows, estimate
-        self._labelled = labelled
-        error = recording.force[labelled.rows] - estimate[labelled.rows]
+    def __init__(self, recording: FingerRecording, rows: Floats, labelled: LabelledPresses) -> None:
+        self._recording, self._rows, self._labelled = recording, rows, labelled
         same = labelled.press[:, None] == labelled.press
         covariance = self._covariance(labelled.rows) + PRESS_VARIANCE_N2 * same
         covariance[np.diag_indices(len(same))] += ROW_VARIANCE_N2
         self._inverse = np.linalg.inv(covariance)
-        self._weight = self._inverse @ error
-        _, log_determinant = np.linalg.slogdet(covariance)
-        fit = float(np.sum(error * self._weight))
-        self.log_evidence = -0.5 * (fit + error.shape[1] * log_determinant)
 
-    def force(self, some: Rows) -> Floats:
-        """Corrected estimates of some rows [N], shape (N, 3)."""
+    def misfit(self, estimate: Floats) -> float:
+        """Squares of the labelled errors over their covariance; less is likelier."""
+        error = self._error(estimate)
+        return float(np.sum(error * (self._inverse @ error)))
+
+    def force(self, estimate: Floats, some: Rows | None = None) -> Floats:
+        """Corrected estimates [N] of some rows, shape (K, 3); None = of all."""
+        some = np.arange(len(estimate)) if some is None else some
+        weight = self._inverse @ self._error(estimate)
         parts = np.array_split(some, max(1, len(some) // 4000))
-        change = [self._covariance(part) @ self._weight for part in parts]
-        return np.asarray(self._estimate[some] + np.vstack(change))
+        change = [self._covariance(part) @ weight for part in parts]
+        return np.asarray(estimate[some] + np.vstack(change))
 
-    def held_out(self) -> Floats:
+    def held_out(self, estimate: Floats) -> Floats:
         """Corrected estimates of the labelled rows, each without its own press, shape (M, 3)."""
         held_out = self._recording.force[self._labelled.rows].astype(np.float64)
+        weight = self._inverse @ self._error(estimate)
         # What is left of a press when it is left out follows from the inverse alone.
         for press in np.unique(self._labelled.press):
             own = self._labelled.press == press
-            held_out[own] -= np.linalg.solve(self._inverse[np.ix_(own, own)], self._weight[own])
+            held_out[own] -= np.linalg.solve(self._inverse[np.ix_(own, own)], weight[own])
         return held_out
 
-    def scale(self) -> float:
+    def scale(self, estimate: Floats) -> float:
         """The factor of the estimates that the labelled rows make likeliest, `LEAST_SCALE` or more.
 
         By generalised least squares with what is believed before: 1, with `SCALE_VARIANCE`.
         """
-        estimate = self._estimate[self._labelled.rows]
-        information = float(np.sum(estimate * (self._inverse @ estimate)))
-        change = float(np.sum(estimate * self._weight)) / (information + 1.0 / SCALE_VARIANCE)
-        return max(LEAST_SCALE, 1.0 + change)
+        known = estimate[self._labelled.rows]
+        weighted = self._inverse @ known
+        information = float(np.sum(known * weighted)) + 1.0 / SCALE_VARIANCE
+        return max(LEAST_SCALE, 1.0 + float(np.sum(weighted * self._error(estimate))) / information)
+
+    def _error(self, estimate: Floats) -> Floats:
+        rows = self._labelled.rows
+        return np.asarray(self._recording.force[rows] - estimate[rows])
 
     def _covariance(self, some: Rows) -> Floats:
         """Of the errors of some rows with those of the labelled ones, shape (N, M)."""
