@@ -72,19 +72,23 @@ _PRODUCTS = (
         }
     };
     auto int_pair_at = [](const int* p) { return *reinterpret_cast<const int2*>(p); };
-    // Half of: target = - sum - sum over i of a_i times transposed b_i
-    auto subtract = [=](double (&sum)[2][4][2], double* target, const double* a, const double* b,
-                        int count, int half) {
-        __syncwarp();  // threads that gathered meet again
-        for (int i = 0; i < count; ++i)
-            add_tiles(sum, a + 1024 * i + 512 * half, b + 1024 * i);
+    // Half of: target = sign times sum
+    auto write = [=](double* target, const double (&sum)[2][4][2], int half, double sign) {
         #pragma unroll
         for (int m = 0; m < 2; ++m)
             #pragma unroll
             for (int n = 0; n < 4; ++n)
                 *reinterpret_cast<double2*>(
                     target + 512 * half + (8 * m + row) * 32 + 8 * n + column)
-                    = make_double2(-sum[m][n][0], -sum[m][n][1]);
+                    = make_double2(sign * sum[m][n][0], sign * sum[m][n][1]);
+    };
+    // Half of: target = - sum - sum over i of a_i times transposed b_i
+    auto subtract = [=](double (&sum)[2][4][2], double* target, const double* a, const double* b,
+                        int count, int half) {
+        __syncwarp();  // threads that gathered meet again
+        for (int i = 0; i < count; ++i)
+            add_tiles(sum, a + 1024 * i + 512 * half, b + 1024 * i);
+        write(target, sum, half, -1.0);
     };
 #else
     // Target = begin - sum over n of a_n times transposed b_n
@@ -229,13 +233,7 @@ _DIVIDE = """
         double sum[2][4][2] = {};
         add_tiles(sum, target + 512 * half, b);
         __syncwarp();  // all have read what is overwritten now
-        #pragma unroll
-        for (int m = 0; m < 2; ++m)
-            #pragma unroll
-            for (int n = 0; n < 4; ++n)
-                *reinterpret_cast<double2*>(
-                    target + 512 * half + (8 * m + row) * 32 + 8 * n + column)
-                    = make_double2(sum[m][n][0], sum[m][n][1]);
+        write(target, sum, half, 1.0);
     };
     __shared__ double exchange[2][2][32];
     constexpr int warps = WP_TILE_BLOCK_DIM / 32, each = 32 / warps;
@@ -323,9 +321,55 @@ _DIVIDE = """
 #endif
 """
 
+_INVERT = """
+    // Row c of the inverse triangle, from that of the triangle and the inverse rows above it:
+    // first times the diagonal's inverse, negative, then times those rows.
+#ifdef PALPATE_TENSOR_CORES
+    // Half of: sum += a times b
+    auto add_straight = [=](double (&sum)[2][4][2], const double* a, const double* b) {
+        a += row * 32 + column;
+        b += column * 32 + row;
+        #pragma unroll 2
+        for (int k = 0; k < 32; k += 8, a += 8, b += 256) {
+            const double2 upper = pair_at(a), lower = pair_at(a + 256);
+            #pragma unroll
+            for (int n = 0; n < 4; ++n)
+                add_product(
+                    sum[0][n], sum[1][n], upper, lower, make_double2(b[8 * n], b[8 * n + 32]));
+        }
+    };
+    auto add_inverse = [=](double (&sum)[2][4][2], const double* scaled, int c, int j, int half) {
+        for (int k = j; k < c; ++k)
+            add_straight(sum, scaled + 1024 * k + 512 * half, tiles_of(k) + 1024 * j);
+    };
+#else
+    auto multiply_straight = [](double* target, const double* a, const double* b, double sign) {
+        for (int i = 0; i < 32; ++i)
+            for (int j = 0; j < 32; ++j)
+                for (int k = 0; k < 32; ++k)
+                    target[32 * i + j] += sign * a[32 * i + k] * b[32 * k + j];
+    };
+    auto scale_tile = [=](double* target, const double* inverse, const double* tile) {
+        double scaled[1024] = {};
+        multiply_straight(scaled, inverse, tile, -1.0);
+        for (int i = 0; i < 1024; ++i)
+            target[i] = scaled[i];
+    };
+    // The tile at j of the scaled row itself may be the target: those before it are done with it.
+    auto invert_tile = [=](double* target, const double* scaled, int c, int j) {
+        double sum[1024] = {};
+        for (int k = j; k < c; ++k)
+            multiply_straight(sum, scaled + 1024 * k, tiles_of(k) + 1024 * j, 1.0);
+        for (int i = 0; i < 1024; ++i)
+            target[i] = sum[i];
+    };
+#endif
+"""
+
 _FACTORISE = (
     _PANEL
     + _DIVIDE
+    + _INVERT
     + """
     bool all_good = true;
 #ifdef PALPATE_TENSOR_CORES
@@ -341,18 +385,43 @@ _FACTORISE = (
         __syncthreads();
         for (int half = 2 * c + 2 + warp; half < 2 * rows; half += warps)
             multiply(tiles_of(half / 2) + 1024 * c, diagonal, half % 2);
+        // What a warp writes, no later one reads; but others of its round do.
+        double* scaled = tiles_of(c);
+        for (int first = 0; first < 2 * c; first += warps) {
+            double sum[2][4][2] = {};
+            const int half = first + warp;
+            if (half < 2 * c)
+                add_straight(sum, diagonal + 512 * (half % 2), scaled + 1024 * (half / 2));
+            __syncthreads();
+            if (half < 2 * c)
+                write(scaled + 1024 * (half / 2), sum, half % 2, -1.0);
+        }
         __syncthreads();
+        for (int first = 0; first < 2 * c; first += warps) {
+            double sum[2][4][2] = {};
+            const int half = first + warp;
+            if (half < 2 * c)
+                add_inverse(sum, scaled, c, half / 2, half % 2);
+            __syncthreads();
+            if (half < 2 * c)
+                write(scaled + 1024 * (half / 2), sum, half % 2, 1.0);
+        }
     }
 #else
     if (thread != 0)
         return;
     for (int c = 0; c < own; ++c) {
-        double* diagonal = tiles_of(c) + 1024 * c;
+        double* scaled = tiles_of(c);
+        double* diagonal = scaled + 1024 * c;
         for (int r = c; r < rows; ++r)
             begin(tiles_of(r) + 1024 * c, r, c, c);
         all_good = invert(diagonal, diagonal) && all_good;
         for (int r = c + 1; r < rows; ++r)
             multiply(tiles_of(r) + 1024 * c, diagonal);
+        for (int j = 0; j < c; ++j)
+            scale_tile(scaled + 1024 * j, diagonal, scaled + 1024 * j);
+        for (int j = 0; j < c; ++j)
+            invert_tile(scaled + 1024 * j, scaled, c, j);
     }
 #endif
     if (thread == 0 && !all_good)
@@ -377,7 +446,9 @@ _DIVIDE_COLUMN = (
     _PRODUCTS
     + FRONT
     + _DIVIDE
+    + _INVERT
     + """
+    double* scaled = scaled_rows.data + size_t(scaled_row) * 1024;
     const double* from = diagonals.data + size_t(diagonal) * 1024;
     double* to = tiles_of(c) + 1024 * c;
 #ifdef PALPATE_TENSOR_CORES
@@ -390,6 +461,11 @@ _DIVIDE_COLUMN = (
     __syncthreads();
     for (int half = 2 * c + 2 + part * warps + warp; half < 2 * rows; half += parts * warps)
         multiply(tiles_of(half / 2) + 1024 * c, inverse, half % 2);
+    for (int half = part * warps + warp; half < 2 * c; half += parts * warps) {
+        double sum[2][4][2] = {};
+        add_straight(sum, inverse + 512 * (half % 2), tiles_of(c) + 1024 * (half / 2));
+        write(scaled + 1024 * (half / 2), sum, half % 2, -1.0);
+    }
     if (part == 0 && thread == 0 && !good)
         bad.data[slot] = 1;
 #else
@@ -399,6 +475,26 @@ _DIVIDE_COLUMN = (
         bad.data[slot] = 1;
     for (int r = c + 1; r < rows; ++r)
         multiply(tiles_of(r) + 1024 * c, to);
+    for (int j = 0; j < c; ++j)
+        scale_tile(scaled + 1024 * j, to, tiles_of(c) + 1024 * j);
+#endif
+"""
+)
+
+_INVERT_TILE = (
+    _PRODUCTS
+    + FRONT
+    + _INVERT
+    + """
+    const double* scaled = scaled_rows.data + size_t(scaled_row) * 1024;
+    double* target = tiles_of(c) + 1024 * j;
+#ifdef PALPATE_TENSOR_CORES
+    double sum[2][4][2] = {};
+    add_inverse(sum, scaled, c, j, thread / 32);
+    write(target, sum, thread / 32, 1.0);
+#else
+    if (thread == 0)
+        invert_tile(target, scaled, c, j);
 #endif
 """
 )
@@ -483,9 +579,9 @@ def factorise_panel(
 
     Children as for `subtract_product`; ``sources_at`` says for each tile of a matrix where the
     numbers of its entries stand in ``sources``. ``first_tile`` is the front's first one in a
-    matrix, ``panel`` that in ``panels``, ``rows`` its rows of tiles. A diagonal tile becomes the
-    inverse of its Cholesky factor; ``bad`` is set where a pivot is not positive, and a tile of ones
-    on the diagonal takes its place. All threads of a block call it.
+    matrix, ``panel`` that in ``panels``, ``rows`` its rows of tiles. The triangle of own columns
+    becomes the inverse of its Cholesky factor; ``bad`` is set where a pivot is not positive, and a
+    tile of ones on the diagonal takes its place. All threads of a block call it.
     """
     ...
 
@@ -514,8 +610,9 @@ def begin_tile(
 ):
     """Gather tile (r, c) of a front's panel; the first one into ``diagonals``. For two warps.
 
-    With `divide_column` and `subtract_column` for each column after it, the same numbers in the
-    same order as `factorise_panel`, to the bit, by as many blocks of threads as there are.
+    With `divide_column`, `subtract_column` and `invert_tile` for each column after it, the same
+    numbers in the same order as `factorise_panel`, to the bit, by as many blocks of threads as
+    there are.
     """
     ...
 
@@ -529,6 +626,8 @@ def divide_column(
     c: int,
     diagonals: wp.array3d(dtype=wp.float64),
     diagonal: int,
+    scaled_rows: wp.array3d(dtype=wp.float64),
+    scaled_row: int,
     part: int,
     parts: int,
     slot: int,
@@ -537,8 +636,24 @@ def divide_column(
 ):
     """Invert the factor of a diagonal tile, which is in ``diagonals``; divide the column below.
 
+    The tiles of its row, too, times this inverse, go to ``scaled_rows``, from ``scaled_row`` on.
     For ``parts`` blocks of threads, each of which inverts it, since to wait for one takes longer.
     """
+    ...
+
+
+@wp.func_native(_INVERT_TILE)
+def invert_tile(
+    panels: wp.array3d(dtype=wp.float64),
+    panel: int,
+    own: int,
+    c: int,
+    j: int,
+    scaled_rows: wp.array3d(dtype=wp.float64),
+    scaled_row: int,
+    thread: int,
+):
+    """Put tile (c, j) of the triangle's inverse in its place, after `divide_column`. Two warps."""
     ...
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from palpate_fem.batched import factor_kernels as kernels
 from palpate_fem.batched import solve_kernels
 from palpate_fem.batched.dense_tiles import LANES, THREADS, TILE, WIDE
+from palpate_fem.batched.dense_vectors import PARTS
 from palpate_fem.batched.launches import Launches
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
 
@@ -155,7 +156,12 @@ class BatchedFactor:
             (slots * tiles.share_tiles, *square), dtype=wp.float64, device=device
         )
         self._diagonals = wp.zeros((self.few, *square), dtype=wp.float64, device=device)
-        self._work = wp.zeros((slots * tiles.rows, LANES), dtype=wp.float64, device=device)
+        rows = self.few * max(width for width, _ in self._largest)
+        self._scaled_rows = wp.zeros((rows, *square), dtype=wp.float64, device=device)
+        shape = (slots * tiles.rows, LANES)
+        self._begun = wp.zeros(shape, dtype=wp.float64, device=device)
+        self._half = wp.zeros(shape, dtype=wp.float64, device=device)
+        self._loaded = wp.zeros_like(self.marked)
         self._fronts = self._ints(tiles.fronts)
         self._children = self._ints(tiles.children)
         self._rows_in_child = self._ints(tiles.rows_in_child)
@@ -174,7 +180,7 @@ class BatchedFactor:
             "levels": float(tiles.levels),
             "gflop": tiles.tree.flop / 1e9,
             "padded_gflop": tiles.gflop,
-            "mib_a_slot": 8.0 * (stored * TILE**2 + tiles.rows * LANES) / 2**20,
+            "mib_a_slot": 8.0 * (stored * TILE**2 + 2 * tiles.rows * LANES) / 2**20,
         }
 
     def factorise(self, slots: wp.array) -> None:
@@ -223,17 +229,17 @@ class BatchedFactor:
         )
         for column in range(width):
             below = height - column - 1
-            parts = max(1, -(-2 * below * TILE // THREADS))
+            parts = max(1, -(-2 * (height - 1) * TILE // THREADS))
             self._launch(
                 kernels.divide_columns,
                 (*shape, parts, THREADS),
-                [*fronts, column, parts, self.tiles.panel_tiles, self._diagonals],
-                [self._panels, self.bad],
+                [*fronts, column, parts, width, self.tiles.panel_tiles, self._diagonals],
+                [self._panels, self._scaled_rows, self.bad],
             )
             self._launch(
                 kernels.subtract_columns,
-                (*shape, (width - column - 1) * below, 2 * TILE),
-                [*fronts, column, width, self.tiles.panel_tiles],
+                (*shape, column + (width - column - 1) * below, 2 * TILE),
+                [*fronts, column, width, self.tiles.panel_tiles, self._scaled_rows],
                 [self._panels, self._diagonals],
             )
 
@@ -263,33 +269,88 @@ class BatchedFactor:
             lanes: How many of them, at most `LANES`.
         """
         count, tiles = len(slots), self.tiles
-        place = [tiles.panel_tiles, tiles.rows]
+        self._loaded.zero_()
         for level in range(tiles.levels):
-            first, last = self._front_begins[level : level + 2]
-            self._launch(
-                solve_kernels.substitute_forward,
-                (count, last - first, block := self._block((last - first) * count)),
-                [slots, self._by_level, self._fronts, self._children, self._rows_in_child,
-                 self._row_links, first, *place, lanes, vectors, self._panels],
-                [self._work],
-                block=block,
+            self._over_fronts(
+                solve_kernels.gather_loads,
+                level,
+                slots,
+                [self._fronts, self._children, self._rows_in_child, self._row_links],
+                [lanes, vectors],
+                [self._begun, self._loaded],
+            )
+            known = [self._fronts, self._loaded]
+            self._over_tiles(
+                solve_kernels.multiply_own_rows, level, slots, self._own_rows, known,
+                [self._begun], self._half,
+            )  # fmt: skip
+            self._over_tiles(
+                solve_kernels.subtract_border_rows, level, slots, self._border_rows, known,
+                [self._half], self._begun,
             )  # fmt: skip
         for level in reversed(range(tiles.levels)):
-            first, last = self._front_begins[level : level + 2]
-            self._launch(
-                solve_kernels.substitute_backward,
-                (count, last - first, block := self._block((last - first) * count)),
-                [slots, self._by_level, self._fronts, self._row_links, first, *place,
-                 self._panels],
-                [self._work],
-                block=block,
+            self._over_fronts(
+                solve_kernels.gather_answers,
+                level,
+                slots,
+                [self._fronts, self._row_links],
+                [self._begun],
+                [self._half],
+            )
+            self._over_tiles(
+                solve_kernels.subtract_border_columns, level, slots, self._own_rows,
+                [self._fronts], [], self._half,
+            )  # fmt: skip
+            self._over_tiles(
+                solve_kernels.multiply_own_columns, level, slots, self._own_rows,
+                [self._fronts], [self._half], self._begun,
             )  # fmt: skip
         self._launch(
             solve_kernels.scatter_solution,
             (count, lanes, self.size),
-            [slots, self._row_of, tiles.rows, self._work],
+            [slots, self._row_of, tiles.rows, self._begun],
             [vectors],
         )
+
+    def _over_fronts(
+        self,
+        kernel: wp.Kernel,
+        level: int,
+        slots: wp.array,
+        plan: list[Any],
+        known: list[Any],
+        out: list[Any],
+    ) -> None:
+        """Launch a kernel for every row of the fronts of a level, two vectors."""
+        first, last = self._front_begins[level : level + 2]
+        rows = self._largest[level][1] * TILE
+        self._launch(
+            kernel,
+            (len(slots), last - first, rows, LANES),
+            [slots, self._by_level, *plan, first, self.tiles.rows, TILE, *known],
+            out,
+        )
+
+    def _over_tiles(
+        self,
+        kernel: wp.Kernel,
+        level: int,
+        slots: wp.array,
+        listed: tuple[wp.array, list[int]],
+        plan: list[Any],
+        known: list[Any],
+        out: wp.array,
+    ) -> None:
+        """Launch a kernel for rows or columns of tiles of a level."""
+        first, last = listed[1][level : level + 2]
+        tiles = self.tiles
+        self._launch(
+            kernel,
+            (len(slots), last - first, TILE * PARTS),
+            [slots, listed[0], *plan, first, tiles.panel_tiles, tiles.rows, TILE, self._panels,
+             *known],
+            [out],
+        )  # fmt: skip
 
     def _plan_entries(self, indptr: NDArray[Any], indices: NDArray[Any]) -> None:
         """Which of the matrix's entries stands at which place of the tiles that have any.
@@ -345,6 +406,10 @@ class BatchedFactor:
         self._by_level = self._ints(order)
         levels = np.arange(tiles.levels + 1)
         self._front_begins = np.searchsorted(tiles.level[order], levels).tolist()
+        self._own_rows = self._rows_of(order, 0 * tiles.own_tiles, tiles.own_tiles)
+        self._border_rows = self._rows_of(
+            order, tiles.own_tiles, tiles.own_tiles + tiles.border_tiles
+        )
         own_row = np.empty(self.size, np.int64)  # of an unknown, in order of elimination
         links = np.full(tiles.rows, -1, np.int64)
         for k, front in enumerate(tree.fronts):
@@ -357,6 +422,15 @@ class BatchedFactor:
         row_of = np.empty(self.size, np.int64)
         row_of[tree.order] = own_row
         self._row_links, self._row_of = self._ints(links), self._ints(row_of)
+
+    def _rows_of(self, order: Ints, begins: Ints, ends: Ints) -> tuple[wp.array, list[int]]:
+        """Front and number of each row of tiles, level after level, and where levels begin."""
+        counts = (ends - begins)[order]
+        front = np.repeat(order, counts)
+        within = np.arange(len(front)) - np.repeat(np.cumsum(counts) - counts, counts)
+        levels = np.arange(self.tiles.levels + 1)
+        first = np.searchsorted(self.tiles.level[front], levels).tolist()
+        return self._ints(np.stack((front, begins[front] + within), axis=1)), first
 
     def _ints(self, values: NDArray[Any]) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=self._device)

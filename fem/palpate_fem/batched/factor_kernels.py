@@ -3,8 +3,9 @@
 
 A front is a dense lower triangle of tiles: its own columns first, padded to whole tiles with ones
 on the diagonal, then its border, padded with zeros. The tiles of its own columns are the *panel*,
-those of border and border the *share* for its parent. A diagonal tile of a factorised panel holds
-the inverse of its Cholesky factor.
+those of border and border the *share* for its parent. The triangle of own columns of a factorised
+panel holds the inverse of its Cholesky factor, so that nothing in a front waits for anything when
+it is solved with.
 
 Only marked fronts of a slot are worked on: those of which an entry has changed since they were
 factorised, and all above them. Nothing is added by atomics, so results depend neither on the order
@@ -150,9 +151,11 @@ def divide_columns(
     first: int,
     column: int,
     parts: int,
+    width: int,
     panel_tiles: int,
     diagonals_in: wp.array3d(dtype=wp.float64),
     panels: wp.array3d(dtype=wp.float64),
+    scaled_rows: wp.array3d(dtype=wp.float64),
     bad: wp.array(dtype=wp.int32),
 ):
     """Factorise the diagonal tile of a column of fronts, and divide by it what is below."""
@@ -162,9 +165,10 @@ def divide_columns(
     own = fronts[front, 0]
     if marked[slot, front] != 0 and column < own:
         panel = slot * panel_tiles + fronts[front, 4]
+        place = number * slots.shape[0] + i
         dense_tiles.divide_column(
-            panels, panel, own, fronts[front, 1], column,
-            diagonals_in, number * slots.shape[0] + i, part, parts, slot, bad, thread,
+            panels, panel, own, fronts[front, 1], column, diagonals_in, place,
+            scaled_rows, place * width, part, parts, slot, bad, thread,
         )  # fmt: skip
 
 
@@ -178,22 +182,33 @@ def subtract_columns(
     column: int,
     width: int,
     panel_tiles: int,
+    scaled_rows_in: wp.array3d(dtype=wp.float64),
     panels: wp.array3d(dtype=wp.float64),
     diagonals: wp.array3d(dtype=wp.float64),
 ):
-    """Subtract a column's products from the columns after it: two warps for a tile."""
+    """Subtract a column's products from the columns after it, and invert its row of the triangle.
+
+    Two warps for a tile; the first ``column`` tiles are those of the row.
+    """
     number, i, tile, thread = wp.tid()
     slot = slots[i]
     front = listed[first + number]
     own = fronts[front, 0]
-    left = width - column - 1
-    r = column + 1 + tile // left
-    j = column + 1 + tile % left
-    if marked[slot, front] != 0 and j < own and j <= r and r < fronts[front, 1]:
-        dense_tiles.subtract_column(
-            panels, slot * panel_tiles + fronts[front, 4], own, column, r, j,
-            diagonals, number * slots.shape[0] + i, thread,
-        )  # fmt: skip
+    if marked[slot, front] != 0 and column < own:
+        panel = slot * panel_tiles + fronts[front, 4]
+        place = number * slots.shape[0] + i
+        if tile < column:
+            dense_tiles.invert_tile(
+                panels, panel, own, column, tile, scaled_rows_in, place * width, thread
+            )
+        else:
+            left = width - column - 1
+            r = column + 1 + (tile - column) // left
+            j = column + 1 + (tile - column) % left
+            if j < own and j <= r and r < fronts[front, 1]:
+                dense_tiles.subtract_column(
+                    panels, panel, own, column, r, j, diagonals, place, thread
+                )
 
 
 @wp.kernel(launch_bounds=(THREADS, 2))
