@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 from tests.fem.batched_cases import DEVICE
 
-from palpate_fem.batched.dense_tiles import TILE
+from palpate_fem.batched.dense_tiles import INVERTED, TILE
 from palpate_fem.batched.factor import BatchedFactor
 from palpate_fem.mechanics.contact import ContactSettings
 from palpate_fem.mechanics.state import SolutionState
@@ -32,6 +32,7 @@ BODIES = [
     (TILE, TILE),
     (TILE + 1, 3),
     (2 * TILE + 5, TILE + 2),
+    ((INVERTED + 1) * TILE + 3, TILE),  # more than one triangle is kept inverted
 ]
 """Sizes of a body and of the joint of two."""
 

@@ -25,6 +25,13 @@ TILE = 32
 LANES = 2
 """Vectors that are multiplied together."""
 
+INVERTED = 8
+"""Tiles of the triangles along a front's diagonal that are kept inverted.
+
+What a triangle has is solved for at once; the next one waits for it. Wider ones cost more to
+invert than they spare: a whole front's, a fifth of the factorisation's time.
+"""
+
 THREADS, WIDE = 256, 512
 """Threads of a block, which share a front: where there are many fronts, and where there are few."""
 
@@ -322,8 +329,9 @@ _DIVIDE = """
 """
 
 _INVERT = """
-    // Row c of the inverse triangle, from that of the triangle and the inverse rows above it:
+    // A row of an inverse triangle, from that of the triangle and the inverse rows above it:
     // first times the diagonal's inverse, negative, then times those rows.
+    auto corner_of = [](int c) { return c - c % INVERTED; };
 #ifdef PALPATE_TENSOR_CORES
     // Half of: sum += a times b
     auto add_straight = [=](double (&sum)[2][4][2], const double* a, const double* b) {
@@ -364,7 +372,7 @@ _INVERT = """
             target[i] = sum[i];
     };
 #endif
-"""
+""".replace("INVERTED", str(INVERTED))
 
 _FACTORISE = (
     _PANEL
@@ -387,7 +395,8 @@ _FACTORISE = (
             multiply(tiles_of(half / 2) + 1024 * c, diagonal, half % 2);
         // What a warp writes, no later one reads; but others of its round do.
         double* scaled = tiles_of(c);
-        for (int first = 0; first < 2 * c; first += warps) {
+        const int corner = 2 * corner_of(c);
+        for (int first = corner; first < 2 * c; first += warps) {
             double sum[2][4][2] = {};
             const int half = first + warp;
             if (half < 2 * c)
@@ -397,7 +406,7 @@ _FACTORISE = (
                 write(scaled + 1024 * (half / 2), sum, half % 2, -1.0);
         }
         __syncthreads();
-        for (int first = 0; first < 2 * c; first += warps) {
+        for (int first = corner; first < 2 * c; first += warps) {
             double sum[2][4][2] = {};
             const int half = first + warp;
             if (half < 2 * c)
@@ -418,9 +427,9 @@ _FACTORISE = (
         all_good = invert(diagonal, diagonal) && all_good;
         for (int r = c + 1; r < rows; ++r)
             multiply(tiles_of(r) + 1024 * c, diagonal);
-        for (int j = 0; j < c; ++j)
+        for (int j = corner_of(c); j < c; ++j)
             scale_tile(scaled + 1024 * j, diagonal, scaled + 1024 * j);
-        for (int j = 0; j < c; ++j)
+        for (int j = corner_of(c); j < c; ++j)
             invert_tile(scaled + 1024 * j, scaled, c, j);
     }
 #endif
@@ -461,7 +470,7 @@ _DIVIDE_COLUMN = (
     __syncthreads();
     for (int half = 2 * c + 2 + part * warps + warp; half < 2 * rows; half += parts * warps)
         multiply(tiles_of(half / 2) + 1024 * c, inverse, half % 2);
-    for (int half = part * warps + warp; half < 2 * c; half += parts * warps) {
+    for (int half = 2 * corner_of(c) + part * warps + warp; half < 2 * c; half += parts * warps) {
         double sum[2][4][2] = {};
         add_straight(sum, inverse + 512 * (half % 2), tiles_of(c) + 1024 * (half / 2));
         write(scaled + 1024 * (half / 2), sum, half % 2, -1.0);
@@ -475,7 +484,7 @@ _DIVIDE_COLUMN = (
         bad.data[slot] = 1;
     for (int r = c + 1; r < rows; ++r)
         multiply(tiles_of(r) + 1024 * c, to);
-    for (int j = 0; j < c; ++j)
+    for (int j = corner_of(c); j < c; ++j)
         scale_tile(scaled + 1024 * j, to, tiles_of(c) + 1024 * j);
 #endif
 """
@@ -579,9 +588,10 @@ def factorise_panel(
 
     Children as for `subtract_product`; ``sources_at`` says for each tile of a matrix where the
     numbers of its entries stand in ``sources``. ``first_tile`` is the front's first one in a
-    matrix, ``panel`` that in ``panels``, ``rows`` its rows of tiles. The triangle of own columns
-    becomes the inverse of its Cholesky factor; ``bad`` is set where a pivot is not positive, and a
-    tile of ones on the diagonal takes its place. All threads of a block call it.
+    matrix, ``panel`` that in ``panels``, ``rows`` its rows of tiles. Triangles of `INVERTED`
+    tiles along the diagonal become the inverses of the Cholesky factor's; ``bad`` is set where a
+    pivot is not positive, and a tile of ones on the diagonal takes its place. All threads of a
+    block call it.
     """
     ...
 
@@ -636,8 +646,9 @@ def divide_column(
 ):
     """Invert the factor of a diagonal tile, which is in ``diagonals``; divide the column below.
 
-    The tiles of its row, too, times this inverse, go to ``scaled_rows``, from ``scaled_row`` on.
-    For ``parts`` blocks of threads, each of which inverts it, since to wait for one takes longer.
+    The tiles of its row in the triangle, times this inverse, go to ``scaled_rows``, from
+    ``scaled_row`` on. For ``parts`` blocks of threads, each of which inverts the diagonal tile,
+    since to wait for one takes longer.
     """
     ...
 
@@ -653,7 +664,7 @@ def invert_tile(
     scaled_row: int,
     thread: int,
 ):
-    """Put tile (c, j) of the triangle's inverse in its place, after `divide_column`. Two warps."""
+    """Put tile (c, j) of a triangle's inverse in its place, after `divide_column`. Two warps."""
     ...
 
 

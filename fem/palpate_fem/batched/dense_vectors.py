@@ -11,7 +11,7 @@ import warp as wp
 
 from palpate_fem.batched.dense_tiles import FRONT, TENSOR_CORES
 
-PARTS = 1
+PARTS = 2
 """Warps that share a row or a column of tiles. Sums do not depend on anything else."""
 
 _VECTORS = (
@@ -62,7 +62,7 @@ _MULTIPLY_ROW = (
     const double* tile = tiles_of(r);
 #ifdef PALPATE_TENSOR_CORES
     double sum[4][2] = {};
-    for (int c = part; c < count; c += parts)
+    for (int c = first + part; c < last; c += parts)
         #pragma unroll
         for (int k = 0; k < 32; k += 8) {
             const double* from = known + 64 * c;
@@ -80,7 +80,7 @@ _MULTIPLY_ROW = (
         return;
     for (int i = 0; i < 64; ++i) {
         double sum = 0.0;
-        for (int c = 0; c < count; ++c)
+        for (int c = first; c < last; ++c)
             for (int k = 0; k < 32; ++k)
                 sum += tile[1024 * c + 32 * (i / 2) + k] * known[64 * c + 2 * k + i % 2];
         result[i] = subtract ? result[i] - sum : sum;
@@ -134,7 +134,8 @@ def multiply_row(
     panel: int,
     own: int,
     r: int,
-    count: int,
+    first: int,
+    last: int,
     source: wp.array2d(dtype=wp.float64),
     source_row: int,
     out: wp.array2d(dtype=wp.float64),
@@ -142,11 +143,11 @@ def multiply_row(
     subtract: int,
     thread: int,
 ):
-    """Set rows of ``out`` to the first ``count`` tiles of row r times ``source``, or subtract it.
+    """Set rows of ``out`` to tiles of row r times ``source``, or subtract that from them.
 
-    ``panel`` is the front's first tile in ``panels`` and ``own`` the tiles of its own columns; the
-    rows of vectors begin at ``source_row`` for column 0, and at ``out_row``. All ``PARTS`` warps
-    call it.
+    These tiles are columns ``first`` up to ``last``, which is not one of them. ``panel`` is the
+    front's first tile in ``panels`` and ``own`` the tiles of its own columns; the rows of vectors
+    begin at ``source_row`` for column 0, and at ``out_row``. All ``PARTS`` warps call it.
     """
     ...
 
@@ -166,7 +167,7 @@ def multiply_column(
     subtract: int,
     thread: int,
 ):
-    """The same with the transposed tiles of column c in rows ``first`` to ``last``.
+    """The same with the transposed tiles of column c, in rows ``first`` up to ``last``.
 
     The rows of ``source`` begin at ``source_row`` for row 0.
     """

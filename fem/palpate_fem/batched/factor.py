@@ -10,7 +10,8 @@ it is. Where only contact has changed, that is most of them.
 
 from __future__ import annotations
 
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -18,9 +19,9 @@ from numpy.typing import NDArray
 
 from palpate_fem.batched import factor_kernels as kernels
 from palpate_fem.batched import solve_kernels
-from palpate_fem.batched.dense_tiles import LANES, THREADS, TILE, WIDE
+from palpate_fem.batched.dense_tiles import INVERTED, LANES, THREADS, TILE, WIDE
 from palpate_fem.batched.dense_vectors import PARTS
-from palpate_fem.batched.launches import Launches
+from palpate_fem.batched.launches import Launches, Sequences
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
 
 
@@ -98,6 +99,14 @@ class FrontTiles:
         return np.asarray(self.fronts[k, 4] + np.where(row < o, own, below))
 
 
+class _Step(NamedTuple):
+    """A triangle of each front of a level: its first tile, and the listed rows of tiles."""
+
+    corner: int
+    own: tuple[int, int]
+    below: tuple[int, int]
+
+
 class BatchedFactor:
     """Factors of matrices with one pattern, one for each slot.
 
@@ -138,6 +147,7 @@ class BatchedFactor:
         # No number is what it was before the first factorisation.
         self._known = wp.full((slots, len(indices)), np.nan, dtype=wp.float64, device=device)
         self._launch = Launches(device)
+        self._sequences = Sequences(device)
         self._processors = wp.get_device(device).sm_count if self.values.device.is_cuda else 0
         self.few = self._processors // 4 if few is None else few
         self._columns = columns
@@ -185,6 +195,9 @@ class BatchedFactor:
 
     def factorise(self, slots: wp.array) -> None:
         """Factorise the matrices of the listed slots, (m,) int32; others keep their factors."""
+        self._sequences("factorise", slots, self._factorise)
+
+    def _factorise(self, slots: wp.array) -> None:
         count, tiles = len(slots), self.tiles
         self._mark(slots)
         sizes = [tiles.panel_tiles, tiles.share_tiles]
@@ -238,7 +251,7 @@ class BatchedFactor:
             )
             self._launch(
                 kernels.subtract_columns,
-                (*shape, column + (width - column - 1) * below, 2 * TILE),
+                (*shape, column % INVERTED + (width - column - 1) * below, 2 * TILE),
                 [*fronts, column, width, self.tiles.panel_tiles, self._scaled_rows],
                 [self._panels, self._diagonals],
             )
@@ -268,46 +281,45 @@ class BatchedFactor:
             vectors: Right-hand sides, then solutions, (slots, lanes or more, n).
             lanes: How many of them, at most `LANES`.
         """
-        count, tiles = len(slots), self.tiles
+        known = ("solve", vectors.ptr, vectors.shape, lanes)
+        self._sequences(known, slots, lambda slots: self._solve(slots, vectors, lanes))
+
+    def _solve(self, slots: wp.array, vectors: wp.array, lanes: int) -> None:
+        tiles = self.tiles
         self._loaded.zero_()
+        plan = [self._row_links, self._children, self._rows_in_child]
         for level in range(tiles.levels):
             self._over_fronts(
-                solve_kernels.gather_loads,
-                level,
-                slots,
-                [self._fronts, self._children, self._rows_in_child, self._row_links],
-                [lanes, vectors],
+                solve_kernels.gather_loads, level, slots, plan, [lanes, vectors],
                 [self._begun, self._loaded],
-            )
-            known = [self._fronts, self._loaded]
-            self._over_tiles(
-                solve_kernels.multiply_own_rows, level, slots, self._own_rows, known,
-                [self._begun], self._half,
             )  # fmt: skip
-            self._over_tiles(
-                solve_kernels.subtract_border_rows, level, slots, self._border_rows, known,
-                [self._half], self._begun,
-            )  # fmt: skip
+            for step in self._steps[level]:
+                corner, fronts = step.corner, [self._fronts, self._loaded]
+                self._over_tiles(
+                    solve_kernels.multiply_rows, slots, step.own, fronts, corner,
+                    self._begun, self._half,
+                )  # fmt: skip
+                self._over_tiles(
+                    solve_kernels.subtract_rows, slots, step.below, fronts, corner,
+                    self._half, self._begun,
+                )  # fmt: skip
         for level in reversed(range(tiles.levels)):
             self._over_fronts(
-                solve_kernels.gather_answers,
-                level,
-                slots,
-                [self._fronts, self._row_links],
-                [self._begun],
-                [self._half],
+                solve_kernels.gather_answers, level, slots, [self._row_links], [], [self._begun]
             )
-            self._over_tiles(
-                solve_kernels.subtract_border_columns, level, slots, self._own_rows,
-                [self._fronts], [], self._half,
-            )  # fmt: skip
-            self._over_tiles(
-                solve_kernels.multiply_own_columns, level, slots, self._own_rows,
-                [self._fronts], [self._half], self._begun,
-            )  # fmt: skip
+            for step in reversed(self._steps[level]):
+                corner, fronts = step.corner, [self._fronts]
+                self._over_tiles(
+                    solve_kernels.subtract_columns, slots, step.own, fronts, corner,
+                    self._begun, self._half,
+                )  # fmt: skip
+                self._over_tiles(
+                    solve_kernels.multiply_columns, slots, step.own, fronts, corner,
+                    self._half, self._begun,
+                )  # fmt: skip
         self._launch(
             solve_kernels.scatter_solution,
-            (count, lanes, self.size),
+            (len(slots), lanes, self.size),
             [slots, self._row_of, tiles.rows, self._begun],
             [vectors],
         )
@@ -323,32 +335,30 @@ class BatchedFactor:
     ) -> None:
         """Launch a kernel for every row of the fronts of a level, two vectors."""
         first, last = self._front_begins[level : level + 2]
-        rows = self._largest[level][1] * TILE
         self._launch(
             kernel,
-            (len(slots), last - first, rows, LANES),
-            [slots, self._by_level, *plan, first, self.tiles.rows, TILE, *known],
+            (len(slots), last - first, self._largest[level][1] * TILE, LANES),
+            [slots, self._by_level, self._fronts, *plan, first, self.tiles.rows, *known],
             out,
         )
 
     def _over_tiles(
         self,
         kernel: wp.Kernel,
-        level: int,
         slots: wp.array,
-        listed: tuple[wp.array, list[int]],
+        listed: tuple[int, int],
         plan: list[Any],
-        known: list[Any],
+        corner: int,
+        known: wp.array,
         out: wp.array,
     ) -> None:
-        """Launch a kernel for rows or columns of tiles of a level."""
-        first, last = listed[1][level : level + 2]
-        tiles = self.tiles
+        """Launch a kernel for listed rows or columns of tiles."""
+        tiles, (first, last) = self.tiles, listed
         self._launch(
             kernel,
             (len(slots), last - first, TILE * PARTS),
-            [slots, listed[0], *plan, first, tiles.panel_tiles, tiles.rows, TILE, self._panels,
-             *known],
+            [slots, self._tile_rows, *plan, first, corner, tiles.panel_tiles, tiles.rows,
+             self._panels, known],
             [out],
         )  # fmt: skip
 
@@ -406,10 +416,7 @@ class BatchedFactor:
         self._by_level = self._ints(order)
         levels = np.arange(tiles.levels + 1)
         self._front_begins = np.searchsorted(tiles.level[order], levels).tolist()
-        self._own_rows = self._rows_of(order, 0 * tiles.own_tiles, tiles.own_tiles)
-        self._border_rows = self._rows_of(
-            order, tiles.own_tiles, tiles.own_tiles + tiles.border_tiles
-        )
+        self._plan_steps(order)
         own_row = np.empty(self.size, np.int64)  # of an unknown, in order of elimination
         links = np.full(tiles.rows, -1, np.int64)
         for k, front in enumerate(tree.fronts):
@@ -423,14 +430,36 @@ class BatchedFactor:
         row_of[tree.order] = own_row
         self._row_links, self._row_of = self._ints(links), self._ints(row_of)
 
-    def _rows_of(self, order: Ints, begins: Ints, ends: Ints) -> tuple[wp.array, list[int]]:
-        """Front and number of each row of tiles, level after level, and where levels begin."""
-        counts = (ends - begins)[order]
-        front = np.repeat(order, counts)
-        within = np.arange(len(front)) - np.repeat(np.cumsum(counts) - counts, counts)
-        levels = np.arange(self.tiles.levels + 1)
-        first = np.searchsorted(self.tiles.level[front], levels).tolist()
-        return self._ints(np.stack((front, begins[front] + within), axis=1)), first
+    def _plan_steps(self, order: Ints) -> None:
+        """Rows of tiles of each step, of all fronts of its level: its triangle's, and below."""
+        tiles, found, end = self.tiles, [], 0
+        own, rows = tiles.fronts[order, 0], tiles.fronts[order, 1]
+
+        def rows_of(begins: Ints, ends: Ints, fronts: Ints) -> tuple[int, int]:
+            nonlocal end
+            counts = ends - begins
+            within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+            row = np.repeat(begins, counts) + within
+            found.append(np.stack((np.repeat(fronts, counts), row), axis=1))
+            end += len(row)
+            return end - len(row), end
+
+        self._steps: list[list[_Step]] = []
+        for first, last in pairwise(self._front_begins):
+            steps = []
+            for corner in range(0, own[first:last].max(), INVERTED):
+                some = np.arange(first, last)[own[first:last] > corner]
+                after = np.minimum(corner + INVERTED, own[some])
+                begins = np.full(len(some), corner)
+                steps.append(
+                    _Step(
+                        corner,
+                        rows_of(begins, after, order[some]),
+                        rows_of(after, rows[some], order[some]),
+                    )
+                )
+            self._steps.append(steps)
+        self._tile_rows = self._ints(np.concatenate(found))
 
     def _ints(self, values: NDArray[Any]) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=self._device)

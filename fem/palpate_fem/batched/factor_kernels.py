@@ -3,9 +3,9 @@
 
 A front is a dense lower triangle of tiles: its own columns first, padded to whole tiles with ones
 on the diagonal, then its border, padded with zeros. The tiles of its own columns are the *panel*,
-those of border and border the *share* for its parent. The triangle of own columns of a factorised
-panel holds the inverse of its Cholesky factor, so that nothing in a front waits for anything when
-it is solved with.
+those of border and border the *share* for its parent. Triangles along the diagonal of a factorised
+panel, `INVERTED` tiles wide, hold the inverses of its Cholesky factor's, so that their rows do not
+wait for each other when it is solved with.
 
 Only marked fronts of a slot are worked on: those of which an entry has changed since they were
 factorised, and all above them. Nothing is added by atomics, so results depend neither on the order
@@ -17,7 +17,7 @@ from __future__ import annotations
 import warp as wp
 
 from palpate_fem.batched import dense_tiles
-from palpate_fem.batched.dense_tiles import THREADS, WIDE
+from palpate_fem.batched.dense_tiles import INVERTED, THREADS, WIDE
 
 wp.set_module_options({"enable_backward": False})
 
@@ -186,9 +186,9 @@ def subtract_columns(
     panels: wp.array3d(dtype=wp.float64),
     diagonals: wp.array3d(dtype=wp.float64),
 ):
-    """Subtract a column's products from the columns after it, and invert its row of the triangle.
+    """Subtract a column's products from the columns after it, and invert its row of a triangle.
 
-    Two warps for a tile; the first ``column`` tiles are those of the row.
+    Two warps for a tile; the first ``within`` tiles are those of the row.
     """
     number, i, tile, thread = wp.tid()
     slot = slots[i]
@@ -197,14 +197,16 @@ def subtract_columns(
     if marked[slot, front] != 0 and column < own:
         panel = slot * panel_tiles + fronts[front, 4]
         place = number * slots.shape[0] + i
-        if tile < column:
+        within = column % wp.static(INVERTED)
+        if tile < within:
             dense_tiles.invert_tile(
-                panels, panel, own, column, tile, scaled_rows_in, place * width, thread
-            )
+                panels, panel, own, column, column - within + tile,
+                scaled_rows_in, place * width, thread,
+            )  # fmt: skip
         else:
             left = width - column - 1
-            r = column + 1 + (tile - column) // left
-            j = column + 1 + (tile - column) % left
+            r = column + 1 + (tile - within) // left
+            j = column + 1 + (tile - within) % left
             if j < own and j <= r and r < fronts[front, 1]:
                 dense_tiles.subtract_column(
                     panels, panel, own, column, r, j, diagonals, place, thread

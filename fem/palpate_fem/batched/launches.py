@@ -1,7 +1,11 @@
-"""Launches of kernels that are kept: to pack twenty arguments takes longer than many a kernel."""
+"""Launches that are kept: to pack twenty arguments takes longer than many a kernel.
+
+For few slots even that is too slow: there, on a GPU, a sequence of launches is kept as a graph.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +15,9 @@ from palpate_fem.batched.dense_tiles import THREADS
 
 KEPT = 2000
 """Launches that are kept: several times those of a sweep."""
+
+GRAPHS_UP_TO = 8
+"""Slots up to which sequences are graphs: with more, kernels take longer than their launches."""
 
 
 class Launches:
@@ -71,6 +78,42 @@ class Launches:
                     command.set_param_at_index(place, now)
                     kept.arguments[place] = now
         command.launch()
+
+
+class Sequences:
+    """Sequences of launches for lists of slots, those for few of them as graphs on a GPU."""
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+        self._graphs: dict[Any, tuple[wp.Graph, wp.array] | None] = {}
+
+    def __call__(self, known: Any, slots: wp.array, launch: Callable[[wp.array], None]) -> None:
+        """Launch a sequence.
+
+        Args:
+            known: What tells it from others; the number of slots does so, too.
+            slots: A list, (m,) int32.
+            launch: Launches it for a list. It must do nothing else, wait for nothing, and launch
+                the same for all lists of one length.
+        """
+        count = len(slots)
+        if not slots.device.is_cuda or not 0 < count <= GRAPHS_UP_TO:
+            launch(slots)
+            return
+        key = (known, count)
+        if key not in self._graphs:  # the first time it compiles what it needs
+            launch(slots)
+            self._graphs[key] = None
+            return
+        kept = self._graphs[key]
+        if kept is None:
+            listed = wp.zeros_like(slots)
+            with wp.ScopedCapture(self._device) as capture:
+                launch(listed)
+            kept = self._graphs[key] = capture.graph, listed
+        graph, listed = kept
+        wp.copy(listed, slots)
+        wp.capture_launch(graph)
 
 
 @dataclass(slots=True)

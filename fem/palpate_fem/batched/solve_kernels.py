@@ -3,8 +3,9 @@
 
 A front has its own rows and those of its border in one stretch of a vector; ``fronts`` and
 ``children`` are those of `FrontTiles`. Two vectors of work pass numbers on: *begun* has what the
-children and the right-hand side give to a front, and at last the solution; *half* is what a
-triangle has been solved with. A triangle is kept inverted, so that rows do not wait for each other.
+right-hand side and the children give to a front, and at last the solution; *half* has what the
+lower triangle is solved for. Triangles along the diagonal are inverted, so their rows do not wait
+for each other: a step of a level is one such triangle of each front, and what stands below it.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from palpate_fem.batched import dense_vectors
+from palpate_fem.batched.dense_tiles import INVERTED, TILE
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,12 +23,11 @@ def gather_loads(
     slots: wp.array(dtype=wp.int32),
     listed: wp.array(dtype=wp.int32),
     fronts: wp.array2d(dtype=wp.int32),
+    row_links: wp.array(dtype=wp.int32),
     children: wp.array2d(dtype=wp.int32),
     rows_in_child: wp.array(dtype=wp.int32),
-    row_links: wp.array(dtype=wp.int32),
     first: int,
     rows: int,
-    tile: int,
     lanes: int,
     vectors_in: wp.array3d(dtype=wp.float64),
     begun: wp.array2d(dtype=wp.float64),
@@ -35,80 +36,87 @@ def gather_loads(
     """Begin the rows of fronts with right-hand sides and what the children's borders add up to.
 
     ``row_links`` has the unknowns of own rows, and for those of borders where they are own rows;
-    -1 = padding. ``loaded`` tells of fronts whose own rows are not all zero.
+    -1 = padding. ``loaded`` tells of fronts whose own rows are not all zero: the load of a
+    correction, at the contact alone, loads few.
     """
     i, number, at, lane = wp.tid()
     slot = slots[i]
     front = listed[first + number]
-    own = fronts[front, 0]
-    if at < tile * fronts[front, 1]:
+    own = at < wp.static(TILE) * fronts[front, 0]
+    if at < wp.static(TILE) * fronts[front, 1]:
         base = slot * rows
         row = fronts[front, 6] + at
         total = wp.float64(0.0)
         if lane < lanes:
-            if at < tile * own and row_links[row] >= 0:
+            if own and row_links[row] >= 0:
                 total = vectors_in[slot, lane, row_links[row]]
             for child in range(fronts[front, 2], fronts[front, 3]):
                 there = rows_in_child[children[child, 0] + at]
                 if there >= 0:
                     total += begun[base + children[child, 2] + there, lane]
         begun[base + row, lane] = total
-        if at < tile * own and total != wp.float64(0.0):
+        if own and total != wp.float64(0.0):
             loaded[slot, front] = 1
 
 
+@wp.func
+def end_of(corner: int, own: int):
+    """First tile after a triangle along the diagonal."""
+    return wp.min(corner + wp.static(INVERTED), own)
+
+
 @wp.kernel
-def multiply_own_rows(
+def multiply_rows(
     slots: wp.array(dtype=wp.int32),
     listed: wp.array2d(dtype=wp.int32),
     fronts: wp.array2d(dtype=wp.int32),
     loaded: wp.array2d(dtype=wp.int32),
     first: int,
+    corner: int,
     panel_tiles: int,
     rows: int,
-    tile: int,
     panels_in: wp.array3d(dtype=wp.float64),
     begun_in: wp.array2d(dtype=wp.float64),
     half: wp.array2d(dtype=wp.float64),
 ):
-    """Multiply the own rows of fronts with the inverse triangle, a row of tiles each."""
+    """Solve with inverse triangles that begin at tile ``corner``: a row of tiles each."""
     i, number, thread = wp.tid()
     slot = slots[i]
     front = listed[first + number, 0]
     r = listed[first + number, 1]
     begin = slot * rows + fronts[front, 6]
-    count = wp.where(loaded[slot, front] != 0, r + 1, 0)
+    last = wp.where(loaded[slot, front] != 0, r + 1, corner)
     dense_vectors.multiply_row(
-        panels_in, slot * panel_tiles + fronts[front, 4], fronts[front, 0], r, count,
-        begun_in, begin, half, begin + tile * r, 0, thread,
+        panels_in, slot * panel_tiles + fronts[front, 4], fronts[front, 0], r, corner, last,
+        begun_in, begin, half, begin + wp.static(TILE) * r, 0, thread,
     )  # fmt: skip
 
 
 @wp.kernel
-def subtract_border_rows(
+def subtract_rows(
     slots: wp.array(dtype=wp.int32),
     listed: wp.array2d(dtype=wp.int32),
     fronts: wp.array2d(dtype=wp.int32),
     loaded: wp.array2d(dtype=wp.int32),
     first: int,
+    corner: int,
     panel_tiles: int,
     rows: int,
-    tile: int,
     panels_in: wp.array3d(dtype=wp.float64),
     half_in: wp.array2d(dtype=wp.float64),
     begun: wp.array2d(dtype=wp.float64),
 ):
-    """Subtract from the borders of loaded fronts, a row of tiles each."""
+    """Subtract what these triangles are solved for from the rows below them."""
     i, number, thread = wp.tid()
     slot = slots[i]
     front = listed[first + number, 0]
     r = listed[first + number, 1]
     own = fronts[front, 0]
     begin = slot * rows + fronts[front, 6]
-    count = wp.where(loaded[slot, front] != 0, own, 0)
+    last = wp.where(loaded[slot, front] != 0, end_of(corner, own), corner)
     dense_vectors.multiply_row(
-        panels_in, slot * panel_tiles + fronts[front, 4], own, r, count,
-        half_in, begin, begun, begin + tile * r, 1, thread,
+        panels_in, slot * panel_tiles + fronts[front, 4], own, r, corner, last,
+        half_in, begin, begun, begin + wp.static(TILE) * r, 1, thread,
     )  # fmt: skip
 
 
@@ -120,35 +128,34 @@ def gather_answers(
     row_links: wp.array(dtype=wp.int32),
     first: int,
     rows: int,
-    tile: int,
-    begun_in: wp.array2d(dtype=wp.float64),
-    half: wp.array2d(dtype=wp.float64),
+    begun: wp.array2d(dtype=wp.float64),
 ):
     """Bring what is solved above to the borders of fronts."""
     i, number, at, lane = wp.tid()
     front = listed[first + number]
-    if at >= tile * fronts[front, 0] and at < tile * fronts[front, 1]:
+    if at >= wp.static(TILE) * fronts[front, 0] and at < wp.static(TILE) * fronts[front, 1]:
         base = slots[i] * rows
         row = fronts[front, 6] + at
         value = wp.float64(0.0)
         if row_links[row] >= 0:
-            value = begun_in[base + row_links[row], lane]
-        half[base + row, lane] = value
+            value = begun[base + row_links[row], lane]
+        begun[base + row, lane] = value
 
 
 @wp.kernel
-def subtract_border_columns(
+def subtract_columns(
     slots: wp.array(dtype=wp.int32),
     listed: wp.array2d(dtype=wp.int32),
     fronts: wp.array2d(dtype=wp.int32),
     first: int,
+    corner: int,
     panel_tiles: int,
     rows: int,
-    tile: int,
     panels_in: wp.array3d(dtype=wp.float64),
+    begun_in: wp.array2d(dtype=wp.float64),
     half: wp.array2d(dtype=wp.float64),
 ):
-    """Subtract what the border gives from the own rows of fronts, a column of tiles each."""
+    """Subtract what the rows below a triangle give from its own: a column of tiles each."""
     i, number, thread = wp.tid()
     slot = slots[i]
     front = listed[first + number, 0]
@@ -156,25 +163,26 @@ def subtract_border_columns(
     own = fronts[front, 0]
     begin = slot * rows + fronts[front, 6]
     dense_vectors.multiply_column(
-        panels_in, slot * panel_tiles + fronts[front, 4], own, c, own, fronts[front, 1],
-        half, begin, half, begin + tile * c, 1, thread,
+        panels_in, slot * panel_tiles + fronts[front, 4], own, c,
+        end_of(corner, own), fronts[front, 1],
+        begun_in, begin, half, begin + wp.static(TILE) * c, 1, thread,
     )  # fmt: skip
 
 
 @wp.kernel
-def multiply_own_columns(
+def multiply_columns(
     slots: wp.array(dtype=wp.int32),
     listed: wp.array2d(dtype=wp.int32),
     fronts: wp.array2d(dtype=wp.int32),
     first: int,
+    corner: int,
     panel_tiles: int,
     rows: int,
-    tile: int,
     panels_in: wp.array3d(dtype=wp.float64),
     half_in: wp.array2d(dtype=wp.float64),
     begun: wp.array2d(dtype=wp.float64),
 ):
-    """Multiply with the transposed inverse triangle, a column of tiles each: the solution."""
+    """Solve with transposed inverse triangles: a column of tiles each."""
     i, number, thread = wp.tid()
     slot = slots[i]
     front = listed[first + number, 0]
@@ -182,8 +190,8 @@ def multiply_own_columns(
     own = fronts[front, 0]
     begin = slot * rows + fronts[front, 6]
     dense_vectors.multiply_column(
-        panels_in, slot * panel_tiles + fronts[front, 4], own, c, c, own,
-        half_in, begin, begun, begin + tile * c, 0, thread,
+        panels_in, slot * panel_tiles + fronts[front, 4], own, c, c, end_of(corner, own),
+        half_in, begin, begun, begin + wp.static(TILE) * c, 0, thread,
     )  # fmt: skip
 
 
