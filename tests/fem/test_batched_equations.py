@@ -390,7 +390,7 @@ def test_slots_that_are_not_listed_stay_as_they_are(batch: Batch) -> None:
         equations.subtract_unsymmetric_product(state, some, batch.change, 0, batch.vectors, 1)
         equations.targets(some, batch.change, 0)
         batch.start.copy_slots(state, some.slots)
-        fraction = np.full(SLOTS, 0.5)
+        fraction = wp.full(SLOTS, 0.5, dtype=wp.float64, device=DEVICE)
         pressures = batch.per_slot((PRESSURE_CHANGE_PA,) * len(PLACES))
         equations.move(state, batch.start, some, batch.change, 0, fraction, pressures)
         equations.update_anchors(state, some)

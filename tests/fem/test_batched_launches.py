@@ -9,7 +9,7 @@ from tests.fem.batched_cases import DEVICE
 
 from palpate_fem.batched import launches
 from palpate_fem.batched.kernels import copy_lane, gather_load
-from palpate_fem.batched.launches import Launches
+from palpate_fem.batched.launches import Launches, Sequences
 
 
 def ints(*values: int) -> wp.array:
@@ -69,3 +69,23 @@ def test_no_more_are_kept_than_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
         launch(copy_lane, (1, 3), [ints(2), source, 1], [out, 0])
         np.testing.assert_array_equal(out.numpy()[2, 0], source.numpy()[2, 1])
     assert len(launch._kept) <= 3
+
+
+@pytest.mark.parametrize("slots", [(2,), (0, 3)])
+def test_a_sequence_reads_its_arguments_each_time(slots: tuple[int, ...]) -> None:
+    """On a GPU the first run of one slot compiles, the second makes a graph, others use it."""
+    launch, run, source, out = Launches(DEVICE), Sequences(DEVICE), vectors(4), vectors(5)
+    listed = ints(*slots)
+
+    def twice(of: wp.array, lane: int, *, to: int) -> None:
+        launch(copy_lane, (len(slots), 3), [listed, of, lane], [out, to])
+        run(listed, launch, copy_lane, (len(slots), 3), [listed, of, lane], [out, 1 - to])
+
+    for seed in range(5):
+        source.assign(vectors(10 + seed))
+        for lane, to in ((0, 1), (1, 0), (1, 1)):
+            out.zero_()
+            run(listed, twice, source, lane, to=to)
+            for slot in slots:
+                for k in range(2):
+                    np.testing.assert_array_equal(out.numpy()[slot, k], source.numpy()[slot, lane])

@@ -26,10 +26,9 @@ LANES = 2
 """Vectors that are multiplied together."""
 
 INVERTED = 8
-"""Tiles of the triangles along a front's diagonal that are kept inverted.
+"""Tiles along a side of the triangles on a front's diagonal that are kept inverted.
 
-What a triangle has is solved for at once; the next one waits for it. Wider ones cost more to
-invert than they spare: a whole front's, a fifth of the factorisation's time.
+What such a triangle is multiplied with is solved for at once; the next triangle waits for it.
 """
 
 THREADS, WIDE = 256, 512
@@ -328,56 +327,9 @@ _DIVIDE = """
 #endif
 """
 
-_INVERT = """
-    // A row of an inverse triangle, from that of the triangle and the inverse rows above it:
-    // first times the diagonal's inverse, negative, then times those rows.
-    auto corner_of = [](int c) { return c - c % INVERTED; };
-#ifdef PALPATE_TENSOR_CORES
-    // Half of: sum += a times b
-    auto add_straight = [=](double (&sum)[2][4][2], const double* a, const double* b) {
-        a += row * 32 + column;
-        b += column * 32 + row;
-        #pragma unroll 2
-        for (int k = 0; k < 32; k += 8, a += 8, b += 256) {
-            const double2 upper = pair_at(a), lower = pair_at(a + 256);
-            #pragma unroll
-            for (int n = 0; n < 4; ++n)
-                add_product(
-                    sum[0][n], sum[1][n], upper, lower, make_double2(b[8 * n], b[8 * n + 32]));
-        }
-    };
-    auto add_inverse = [=](double (&sum)[2][4][2], const double* scaled, int c, int j, int half) {
-        for (int k = j; k < c; ++k)
-            add_straight(sum, scaled + 1024 * k + 512 * half, tiles_of(k) + 1024 * j);
-    };
-#else
-    auto multiply_straight = [](double* target, const double* a, const double* b, double sign) {
-        for (int i = 0; i < 32; ++i)
-            for (int j = 0; j < 32; ++j)
-                for (int k = 0; k < 32; ++k)
-                    target[32 * i + j] += sign * a[32 * i + k] * b[32 * k + j];
-    };
-    auto scale_tile = [=](double* target, const double* inverse, const double* tile) {
-        double scaled[1024] = {};
-        multiply_straight(scaled, inverse, tile, -1.0);
-        for (int i = 0; i < 1024; ++i)
-            target[i] = scaled[i];
-    };
-    // The tile at j of the scaled row itself may be the target: those before it are done with it.
-    auto invert_tile = [=](double* target, const double* scaled, int c, int j) {
-        double sum[1024] = {};
-        for (int k = j; k < c; ++k)
-            multiply_straight(sum, scaled + 1024 * k, tiles_of(k) + 1024 * j, 1.0);
-        for (int i = 0; i < 1024; ++i)
-            target[i] = sum[i];
-    };
-#endif
-""".replace("INVERTED", str(INVERTED))
-
 _FACTORISE = (
     _PANEL
     + _DIVIDE
-    + _INVERT
     + """
     bool all_good = true;
 #ifdef PALPATE_TENSOR_CORES
@@ -393,44 +345,18 @@ _FACTORISE = (
         __syncthreads();
         for (int half = 2 * c + 2 + warp; half < 2 * rows; half += warps)
             multiply(tiles_of(half / 2) + 1024 * c, diagonal, half % 2);
-        // What a warp writes, no later one reads; but others of its round do.
-        double* scaled = tiles_of(c);
-        const int corner = 2 * corner_of(c);
-        for (int first = corner; first < 2 * c; first += warps) {
-            double sum[2][4][2] = {};
-            const int half = first + warp;
-            if (half < 2 * c)
-                add_straight(sum, diagonal + 512 * (half % 2), scaled + 1024 * (half / 2));
-            __syncthreads();
-            if (half < 2 * c)
-                write(scaled + 1024 * (half / 2), sum, half % 2, -1.0);
-        }
         __syncthreads();
-        for (int first = corner; first < 2 * c; first += warps) {
-            double sum[2][4][2] = {};
-            const int half = first + warp;
-            if (half < 2 * c)
-                add_inverse(sum, scaled, c, half / 2, half % 2);
-            __syncthreads();
-            if (half < 2 * c)
-                write(scaled + 1024 * (half / 2), sum, half % 2, 1.0);
-        }
     }
 #else
     if (thread != 0)
         return;
     for (int c = 0; c < own; ++c) {
-        double* scaled = tiles_of(c);
-        double* diagonal = scaled + 1024 * c;
+        double* diagonal = tiles_of(c) + 1024 * c;
         for (int r = c; r < rows; ++r)
             begin(tiles_of(r) + 1024 * c, r, c, c);
         all_good = invert(diagonal, diagonal) && all_good;
         for (int r = c + 1; r < rows; ++r)
             multiply(tiles_of(r) + 1024 * c, diagonal);
-        for (int j = corner_of(c); j < c; ++j)
-            scale_tile(scaled + 1024 * j, diagonal, scaled + 1024 * j);
-        for (int j = corner_of(c); j < c; ++j)
-            invert_tile(scaled + 1024 * j, scaled, c, j);
     }
 #endif
     if (thread == 0 && !all_good)
@@ -455,9 +381,7 @@ _DIVIDE_COLUMN = (
     _PRODUCTS
     + FRONT
     + _DIVIDE
-    + _INVERT
     + """
-    double* scaled = scaled_rows.data + size_t(scaled_row) * 1024;
     const double* from = diagonals.data + size_t(diagonal) * 1024;
     double* to = tiles_of(c) + 1024 * c;
 #ifdef PALPATE_TENSOR_CORES
@@ -470,11 +394,6 @@ _DIVIDE_COLUMN = (
     __syncthreads();
     for (int half = 2 * c + 2 + part * warps + warp; half < 2 * rows; half += parts * warps)
         multiply(tiles_of(half / 2) + 1024 * c, inverse, half % 2);
-    for (int half = 2 * corner_of(c) + part * warps + warp; half < 2 * c; half += parts * warps) {
-        double sum[2][4][2] = {};
-        add_straight(sum, inverse + 512 * (half % 2), tiles_of(c) + 1024 * (half / 2));
-        write(scaled + 1024 * (half / 2), sum, half % 2, -1.0);
-    }
     if (part == 0 && thread == 0 && !good)
         bad.data[slot] = 1;
 #else
@@ -484,26 +403,83 @@ _DIVIDE_COLUMN = (
         bad.data[slot] = 1;
     for (int r = c + 1; r < rows; ++r)
         multiply(tiles_of(r) + 1024 * c, to);
-    for (int j = corner_of(c); j < c; ++j)
-        scale_tile(scaled + 1024 * j, to, tiles_of(c) + 1024 * j);
 #endif
 """
 )
 
-_INVERT_TILE = (
+_INVERT_TRIANGLE = (
     _PRODUCTS
     + FRONT
-    + _INVERT
     + """
-    const double* scaled = scaled_rows.data + size_t(scaled_row) * 1024;
-    double* target = tiles_of(c) + 1024 * j;
+    // Row after row, in place: times the diagonal's inverse, negative, then times the rows above,
+    // which are inverted.
 #ifdef PALPATE_TENSOR_CORES
-    double sum[2][4][2] = {};
-    add_inverse(sum, scaled, c, j, thread / 32);
-    write(target, sum, thread / 32, 1.0);
+    // Half of: sum += a times b
+    auto add_product_of = [=](double (&sum)[2][4][2], const double* a, const double* b) {
+        a += row * 32 + column;
+        b += column * 32 + row;
+        #pragma unroll 2
+        for (int k = 0; k < 32; k += 8, a += 8, b += 256) {
+            const double2 upper = pair_at(a), lower = pair_at(a + 256);
+            #pragma unroll
+            for (int n = 0; n < 4; ++n)
+                add_product(
+                    sum[0][n], sum[1][n], upper, lower, make_double2(b[8 * n], b[8 * n + 32]));
+        }
+    };
+    constexpr int warps = WP_TILE_BLOCK_DIM / 32;
+    const int warp = thread / 32;
+    for (int c = corner + 1; c < end; ++c) {
+        double* tiles_in_row = tiles_of(c);
+        const double* diagonal = tiles_in_row + 1024 * c;
+        // Warps of one round read what they overwrite; later ones read none of it.
+        for (int first = 2 * corner; first < 2 * c; first += warps) {
+            const int j = (first + warp) / 2, half = warp % 2;
+            double sum[2][4][2] = {};
+            if (j < c)
+                add_product_of(sum, diagonal + 512 * half, tiles_in_row + 1024 * j);
+            __syncthreads();
+            if (j < c)
+                write(tiles_in_row + 1024 * j, sum, half, -1.0);
+        }
+        __syncthreads();
+        for (int first = 2 * corner; first < 2 * c; first += warps) {
+            const int j = (first + warp) / 2, half = warp % 2;
+            double sum[2][4][2] = {};
+            if (j < c)
+                for (int k = j; k < c; ++k)
+                    add_product_of(
+                        sum, tiles_in_row + 1024 * k + 512 * half, tiles_of(k) + 1024 * j);
+            __syncthreads();
+            if (j < c)
+                write(tiles_in_row + 1024 * j, sum, half, 1.0);
+        }
+    }
 #else
-    if (thread == 0)
-        invert_tile(target, scaled, c, j);
+    if (thread != 0)
+        return;
+    auto add_product_of = [](double* sum, const double* a, const double* b) {
+        for (int i = 0; i < 32; ++i)
+            for (int j = 0; j < 32; ++j)
+                for (int k = 0; k < 32; ++k)
+                    sum[32 * i + j] += a[32 * i + k] * b[32 * k + j];
+    };
+    for (int c = corner + 1; c < end; ++c) {
+        double* tiles_in_row = tiles_of(c);
+        for (int j = corner; j < c; ++j) {
+            double sum[1024] = {};
+            add_product_of(sum, tiles_in_row + 1024 * c, tiles_in_row + 1024 * j);
+            for (int i = 0; i < 1024; ++i)
+                tiles_in_row[1024 * j + i] = -sum[i];
+        }
+        for (int j = corner; j < c; ++j) {
+            double sum[1024] = {};
+            for (int k = j; k < c; ++k)
+                add_product_of(sum, tiles_in_row + 1024 * k, tiles_of(k) + 1024 * j);
+            for (int i = 0; i < 1024; ++i)
+                tiles_in_row[1024 * j + i] = sum[i];
+        }
+    }
 #endif
 """
 )
@@ -588,10 +564,9 @@ def factorise_panel(
 
     Children as for `subtract_product`; ``sources_at`` says for each tile of a matrix where the
     numbers of its entries stand in ``sources``. ``first_tile`` is the front's first one in a
-    matrix, ``panel`` that in ``panels``, ``rows`` its rows of tiles. Triangles of `INVERTED`
-    tiles along the diagonal become the inverses of the Cholesky factor's; ``bad`` is set where a
-    pivot is not positive, and a tile of ones on the diagonal takes its place. All threads of a
-    block call it.
+    matrix, ``panel`` that in ``panels``, ``rows`` its rows of tiles. A diagonal tile becomes the
+    inverse of its Cholesky factor; ``bad`` is set where a pivot is not positive, and a tile of ones
+    on the diagonal takes its place. All threads of a block call it.
     """
     ...
 
@@ -620,9 +595,8 @@ def begin_tile(
 ):
     """Gather tile (r, c) of a front's panel; the first one into ``diagonals``. For two warps.
 
-    With `divide_column`, `subtract_column` and `invert_tile` for each column after it, the same
-    numbers in the same order as `factorise_panel`, to the bit, by as many blocks of threads as
-    there are.
+    With `divide_column` and `subtract_column` for each column after it, the same numbers in the
+    same order as `factorise_panel`, to the bit, by as many blocks of threads as there are.
     """
     ...
 
@@ -636,8 +610,6 @@ def divide_column(
     c: int,
     diagonals: wp.array3d(dtype=wp.float64),
     diagonal: int,
-    scaled_rows: wp.array3d(dtype=wp.float64),
-    scaled_row: int,
     part: int,
     parts: int,
     slot: int,
@@ -646,25 +618,8 @@ def divide_column(
 ):
     """Invert the factor of a diagonal tile, which is in ``diagonals``; divide the column below.
 
-    The tiles of its row in the triangle, times this inverse, go to ``scaled_rows``, from
-    ``scaled_row`` on. For ``parts`` blocks of threads, each of which inverts the diagonal tile,
-    since to wait for one takes longer.
+    For ``parts`` blocks of threads, each of which inverts it, since to wait for one takes longer.
     """
-    ...
-
-
-@wp.func_native(_INVERT_TILE)
-def invert_tile(
-    panels: wp.array3d(dtype=wp.float64),
-    panel: int,
-    own: int,
-    c: int,
-    j: int,
-    scaled_rows: wp.array3d(dtype=wp.float64),
-    scaled_row: int,
-    thread: int,
-):
-    """Put tile (c, j) of a triangle's inverse in its place, after `divide_column`. Two warps."""
     ...
 
 
@@ -683,5 +638,21 @@ def subtract_column(
     """Subtract column c's product from tile (r, j); the next diagonal's goes into ``diagonals``.
 
     For two warps.
+    """
+    ...
+
+
+@wp.func_native(_INVERT_TRIANGLE)
+def invert_triangle(
+    panels: wp.array3d(dtype=wp.float64),
+    panel: int,
+    own: int,
+    corner: int,
+    end: int,
+    thread: int,
+):
+    """Invert a triangle on the diagonal of a factorised panel, tiles ``corner`` up to ``end``.
+
+    Its diagonal tiles are inverted. All threads of a block call it.
     """
     ...

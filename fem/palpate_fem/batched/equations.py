@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.batched import kernels, mortar_kernels
-from palpate_fem.batched.launches import Launches
+from palpate_fem.batched.launches import Launches, Sequences
 from palpate_fem.batched.state import (
     BatchedState,
     Listed,
@@ -63,7 +63,7 @@ class BatchedEquations:
         """
         self.system, self.slots, self.device = system, slots, device
         self._lists: dict[bytes, Listed] = {}
-        self._launch = Launches(device)
+        self._launch, self._sequences = Launches(device), Sequences(device)
         mesh, pattern, skin = system.mesh, system.pattern, system.skin
         self._law, self._core_law = system.contact.law(friction), system.contact.law(0.0)
         self._nodes, self._elements_each = len(mesh.nodes), len(mesh.elements)
@@ -126,7 +126,6 @@ class BatchedEquations:
         self._margin = wp.float64(system.contact.margin_m)
         self._numbers = room(wp.float64, slots, kernels.NUMBERS)
         self._longest = room(wp.float64, slots)
-        self._fraction = room(wp.float64, slots)
 
     def _kinds(self, indenters: Sequence[Indenter]) -> None:
         """Rows of all indenters, and from which gap on each holds directions."""
@@ -522,6 +521,11 @@ class BatchedEquations:
 
     def longest_move(self, listed: Listed, change: wp.array, lane: int) -> Floats:
         """Longest move of a node of each listed slot [m], (m,); infinite if one is no number."""
+        self._sequences(listed.slots, self._find_longest, listed, change, lane)
+        square = self._longest.numpy()[listed.numbers]
+        return np.asarray(np.where(square < 1e299, np.sqrt(square), np.inf))
+
+    def _find_longest(self, listed: Listed, change: wp.array, lane: int) -> None:
         moved = self._as_field(listed, change, lane)
         self._longest.zero_()
         self._launch(
@@ -530,8 +534,6 @@ class BatchedEquations:
             [listed.slots, self._nodes, moved],
             [self._longest],
         )
-        square = self._longest.numpy()[listed.numbers]
-        return np.asarray(np.where(square < 1e299, np.sqrt(square), np.inf))
 
     def targets(
         self, listed: Listed, change: wp.array, lane: int, *, following: Listed | None = None
@@ -567,43 +569,42 @@ class BatchedEquations:
         listed: Listed,
         change: wp.array,
         lane: int,
-        fraction: Floats,
+        fraction: wp.array,
         pressure_change: wp.array,
     ) -> None:
         """Go a share, (slots,), of the way from a state to its targets."""
-        self._fraction.assign(fraction)
         slots, count = listed.slots, len(listed.slots)
         self._launch(
             kernels.move_nodes,
             (count, self.size),
-            [slots, self._free, self._nodes, self._fraction, change, lane,
+            [slots, self._free, self._nodes, fraction, change, lane,
              rows_of_three(start.position)],
             [rows_of_three(state.position)],
         )  # fmt: skip
         self._launch(
             kernels.move_fluid,
             count,
-            [slots, self._fraction, start.fluid_pressure, pressure_change],
+            [slots, fraction, start.fluid_pressure, pressure_change],
             [state.fluid_pressure],
         )
         self._launch(
             kernels.go_towards,
             (count, self._elements_each),
-            [slots, self._elements_each, self._fraction, start.pressure, self._target],
+            [slots, self._elements_each, fraction, start.pressure, self._target],
             [state.pressure],
         )
         outer, inner = self.outer, self.inner
         self._launch(
             kernels.move_contact,
             len(listed.outer),
-            [listed.outer, outer.count, self._fraction, start.indenter_pressure, outer.target,
+            [listed.outer, outer.count, fraction, start.indenter_pressure, outer.target,
              start.traction, outer.target_traction],
             [state.indenter_pressure, state.traction],
         )  # fmt: skip
         self._launch(
             kernels.move_contact,
             len(listed.inner),
-            [listed.inner, inner.count, self._fraction, start.core_pressure, inner.target,
+            [listed.inner, inner.count, fraction, start.core_pressure, inner.target,
              inner.wanted_traction, inner.wanted_traction],
             [state.core_pressure, inner.target_traction],
         )  # fmt: skip

@@ -166,8 +166,6 @@ class BatchedFactor:
             (slots * tiles.share_tiles, *square), dtype=wp.float64, device=device
         )
         self._diagonals = wp.zeros((self.few, *square), dtype=wp.float64, device=device)
-        rows = self.few * max(width for width, _ in self._largest)
-        self._scaled_rows = wp.zeros((rows, *square), dtype=wp.float64, device=device)
         shape = (slots * tiles.rows, LANES)
         self._begun = wp.zeros(shape, dtype=wp.float64, device=device)
         self._half = wp.zeros(shape, dtype=wp.float64, device=device)
@@ -195,7 +193,7 @@ class BatchedFactor:
 
     def factorise(self, slots: wp.array) -> None:
         """Factorise the matrices of the listed slots, (m,) int32; others keep their factors."""
-        self._sequences("factorise", slots, self._factorise)
+        self._sequences(slots, self._factorise, slots)
 
     def _factorise(self, slots: wp.array) -> None:
         count, tiles = len(slots), self.tiles
@@ -225,6 +223,12 @@ class BatchedFactor:
                 [slots, self.marked, self._products, *plan, first, *sizes, self._panels],
                 [self._shares],
             )
+        self._launch(
+            kernels.invert_triangles,
+            (len(self._triangles), count, THREADS),
+            [slots, self.marked, self._triangles, self._fronts, tiles.panel_tiles],
+            [self._panels],
+        )
 
     def _factorise_by_columns(
         self, level: int, slots: wp.array, begin: list[Any], known: list[Any]
@@ -242,17 +246,17 @@ class BatchedFactor:
         )
         for column in range(width):
             below = height - column - 1
-            parts = max(1, -(-2 * (height - 1) * TILE // THREADS))
+            parts = max(1, -(-2 * below * TILE // THREADS))
             self._launch(
                 kernels.divide_columns,
                 (*shape, parts, THREADS),
-                [*fronts, column, parts, width, self.tiles.panel_tiles, self._diagonals],
-                [self._panels, self._scaled_rows, self.bad],
+                [*fronts, column, parts, self.tiles.panel_tiles, self._diagonals],
+                [self._panels, self.bad],
             )
             self._launch(
                 kernels.subtract_columns,
-                (*shape, column % INVERTED + (width - column - 1) * below, 2 * TILE),
-                [*fronts, column, width, self.tiles.panel_tiles, self._scaled_rows],
+                (*shape, (width - column - 1) * below, 2 * TILE),
+                [*fronts, column, width, self.tiles.panel_tiles],
                 [self._panels, self._diagonals],
             )
 
@@ -281,8 +285,7 @@ class BatchedFactor:
             vectors: Right-hand sides, then solutions, (slots, lanes or more, n).
             lanes: How many of them, at most `LANES`.
         """
-        known = ("solve", vectors.ptr, vectors.shape, lanes)
-        self._sequences(known, slots, lambda slots: self._solve(slots, vectors, lanes))
+        self._sequences(slots, self._solve, slots, vectors, lanes)
 
     def _solve(self, slots: wp.array, vectors: wp.array, lanes: int) -> None:
         tiles = self.tiles
@@ -432,7 +435,7 @@ class BatchedFactor:
 
     def _plan_steps(self, order: Ints) -> None:
         """Rows of tiles of each step, of all fronts of its level: its triangle's, and below."""
-        tiles, found, end = self.tiles, [], 0
+        tiles, found, triangles, end = self.tiles, [], [], 0
         own, rows = tiles.fronts[order, 0], tiles.fronts[order, 1]
 
         def rows_of(begins: Ints, ends: Ints, fronts: Ints) -> tuple[int, int]:
@@ -451,6 +454,8 @@ class BatchedFactor:
                 some = np.arange(first, last)[own[first:last] > corner]
                 after = np.minimum(corner + INVERTED, own[some])
                 begins = np.full(len(some), corner)
+                more = after - corner > 1  # a single tile is inverted as it is
+                triangles.append(np.stack((order[some], begins), axis=1)[more])
                 steps.append(
                     _Step(
                         corner,
@@ -460,6 +465,7 @@ class BatchedFactor:
                 )
             self._steps.append(steps)
         self._tile_rows = self._ints(np.concatenate(found))
+        self._triangles = self._ints(np.concatenate(triangles))
 
     def _ints(self, values: NDArray[Any]) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=self._device)

@@ -3,9 +3,9 @@
 
 A front is a dense lower triangle of tiles: its own columns first, padded to whole tiles with ones
 on the diagonal, then its border, padded with zeros. The tiles of its own columns are the *panel*,
-those of border and border the *share* for its parent. Triangles along the diagonal of a factorised
-panel, `INVERTED` tiles wide, hold the inverses of its Cholesky factor's, so that their rows do not
-wait for each other when it is solved with.
+those of border and border the *share* for its parent. Triangles on the diagonal of a factorised
+panel, `INVERTED` tiles wide, hold the inverses of those of its Cholesky factor, so that their rows
+do not wait for each other when it is solved with.
 
 Only marked fronts of a slot are worked on: those of which an entry has changed since they were
 factorised, and all above them. Nothing is added by atomics, so results depend neither on the order
@@ -151,11 +151,9 @@ def divide_columns(
     first: int,
     column: int,
     parts: int,
-    width: int,
     panel_tiles: int,
     diagonals_in: wp.array3d(dtype=wp.float64),
     panels: wp.array3d(dtype=wp.float64),
-    scaled_rows: wp.array3d(dtype=wp.float64),
     bad: wp.array(dtype=wp.int32),
 ):
     """Factorise the diagonal tile of a column of fronts, and divide by it what is below."""
@@ -165,10 +163,9 @@ def divide_columns(
     own = fronts[front, 0]
     if marked[slot, front] != 0 and column < own:
         panel = slot * panel_tiles + fronts[front, 4]
-        place = number * slots.shape[0] + i
         dense_tiles.divide_column(
-            panels, panel, own, fronts[front, 1], column, diagonals_in, place,
-            scaled_rows, place * width, part, parts, slot, bad, thread,
+            panels, panel, own, fronts[front, 1], column,
+            diagonals_in, number * slots.shape[0] + i, part, parts, slot, bad, thread,
         )  # fmt: skip
 
 
@@ -182,35 +179,22 @@ def subtract_columns(
     column: int,
     width: int,
     panel_tiles: int,
-    scaled_rows_in: wp.array3d(dtype=wp.float64),
     panels: wp.array3d(dtype=wp.float64),
     diagonals: wp.array3d(dtype=wp.float64),
 ):
-    """Subtract a column's products from the columns after it, and invert its row of a triangle.
-
-    Two warps for a tile; the first ``within`` tiles are those of the row.
-    """
+    """Subtract a column's products from the columns after it: two warps for a tile."""
     number, i, tile, thread = wp.tid()
     slot = slots[i]
     front = listed[first + number]
     own = fronts[front, 0]
-    if marked[slot, front] != 0 and column < own:
-        panel = slot * panel_tiles + fronts[front, 4]
-        place = number * slots.shape[0] + i
-        within = column % wp.static(INVERTED)
-        if tile < within:
-            dense_tiles.invert_tile(
-                panels, panel, own, column, column - within + tile,
-                scaled_rows_in, place * width, thread,
-            )  # fmt: skip
-        else:
-            left = width - column - 1
-            r = column + 1 + (tile - within) // left
-            j = column + 1 + (tile - within) % left
-            if j < own and j <= r and r < fronts[front, 1]:
-                dense_tiles.subtract_column(
-                    panels, panel, own, column, r, j, diagonals, place, thread
-                )
+    left = width - column - 1
+    r = column + 1 + tile // left
+    j = column + 1 + tile % left
+    if marked[slot, front] != 0 and j < own and j <= r and r < fronts[front, 1]:
+        dense_tiles.subtract_column(
+            panels, slot * panel_tiles + fronts[front, 4], own, column, r, j,
+            diagonals, number * slots.shape[0] + i, thread,
+        )  # fmt: skip
 
 
 @wp.kernel(launch_bounds=(THREADS, 2))
@@ -247,4 +231,26 @@ def subtract_products(
             children, rows_in_child, child, last_child, first_share,
             panels_in, border + row * own, border + column * own, own,
             shares, tile, own + row, own + column, thread,
+        )  # fmt: skip
+
+
+@wp.kernel(launch_bounds=(THREADS, 2))
+def invert_triangles(
+    slots: wp.array(dtype=wp.int32),
+    marked: wp.array2d(dtype=wp.int32),
+    listed: wp.array2d(dtype=wp.int32),
+    fronts: wp.array2d(dtype=wp.int32),
+    panel_tiles: int,
+    panels: wp.array3d(dtype=wp.float64),
+):
+    """Invert triangles on the diagonals of fronts; ``listed`` has the front and the first tile."""
+    number, i, thread = wp.tid()
+    slot = slots[i]
+    front = listed[number, 0]
+    corner = listed[number, 1]
+    if marked[slot, front] != 0:
+        own = fronts[front, 0]
+        dense_tiles.invert_triangle(
+            panels, slot * panel_tiles + fronts[front, 4], own, corner,
+            wp.min(corner + wp.static(INVERTED), own), thread,
         )  # fmt: skip

@@ -18,8 +18,9 @@ from palpate.errors import ConfigError, SimulationError
 from palpate.rigid import rotation_matrices
 from palpate_fem.arrays import Floats
 from palpate_fem.batched.equations import BatchedEquations
+from palpate_fem.batched.launches import Sequences
 from palpate_fem.batched.linear import CHANGE, BatchedLinearSystem
-from palpate_fem.batched.state import BatchedState, SlotNumbers
+from palpate_fem.batched.state import BatchedState, Listed, SlotNumbers
 from palpate_fem.batched.steps import BatchedSteps
 from palpate_fem.batched.trajectory import (
     Accept,
@@ -119,9 +120,10 @@ class BatchedFingertip:
         self._steps = BatchedSteps(self.equations, tip.nodes)
         self._on_step: Callable[[int, IndentationStep], None] | None = None
         self._viscosity = np.zeros(slots)
-        self._ratios, self._viscosities = (
-            wp.zeros(slots, dtype=wp.float64, device=device) for _ in range(2)
+        self._ratios, self._viscosities, self._fractions = (
+            wp.zeros(slots, dtype=wp.float64, device=device) for _ in range(3)
         )
+        self._sequences = Sequences(device)
         self._skin = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
 
     def indent(
@@ -283,16 +285,24 @@ class BatchedFingertip:
                 self._pose(live, begin)
                 listed = self.equations.listed(np.array(begin))
                 self._ratios.assign(ratio)
-                self._trial.extrapolate(self._now, self._before, self._ratios, listed.slots)
+                self._sequences(listed.slots, self._extrapolate, listed)
             listed, moved = (self.equations.listed(np.array(some, int)) for some in (slots, begin))
-            self.equations.correct_contact(self._trial, listed)
-            self.equations.balance(self._trial, listed, moved=moved)
+            self._sequences(listed.slots, self._balance, listed, listed, moved)
             numbers = self.equations.numbers(self._trial, listed)
             for slot, found in zip(slots, numbers, strict=True):
                 live[slot].numbers = found
                 begins = isinstance(live[slot].wanted, Begin)
                 self._go_on(live[slot], found if begins else (found, found.sets_changed))
             self._end_increments(live)
+
+    def _extrapolate(self, listed: Listed) -> None:
+        self._trial.extrapolate(self._now, self._before, self._ratios, listed.slots)
+
+    def _balance(self, listed: Listed, renewing: Listed | None, moved: Listed) -> None:
+        """Evaluate the forces of trial states, and the gaps' offsets of some before."""
+        if renewing is not None:
+            self.equations.correct_contact(self._trial, renewing)
+        self.equations.balance(self._trial, listed, moved=moved)
 
     def _factorise(self, live: dict[int, _Live]) -> None:
         """Serve factorisations, again where a viscosity has to rise."""
@@ -332,21 +342,17 @@ class BatchedFingertip:
             wanted = live[slot].wanted
             assert isinstance(wanted, Step)
             fraction[slot] = min(wanted.damping, most / max(float(far), 1e-300))
-        equations.targets(listed, linear.change, CHANGE, following=following)
-        self._start.copy_slots(self._trial, listed.slots)
+        self._sequences(listed.slots, self._aim, listed, following)
         left = [slot for slot, far in zip(slots, longest, strict=True) if np.isfinite(far)]
         answers: dict[int, SlotNumbers] = {}
         for _ in range(HALVINGS):
             if not left:
                 break
             some = listed if len(left) == len(slots) else equations.listed(np.array(left))
-            equations.move(
-                self._trial, self._start, some, linear.change, CHANGE, fraction,
-                linear.pressure_change,
-            )  # fmt: skip
-            if again := [slot for slot in left if slot in renewing]:
-                equations.correct_contact(self._trial, equations.listed(np.array(again)))
-            equations.balance(self._trial, some)
+            self._fractions.assign(fraction)
+            again = [slot for slot in left if slot in renewing]
+            others = equations.listed(np.array(again)) if again else None
+            self._sequences(some.slots, self._move, some, others)
             for slot, found in zip(left, equations.numbers(self._trial, some), strict=True):
                 if found.smallest_jacobian > 0.0:
                     answers[slot] = found
@@ -360,15 +366,26 @@ class BatchedFingertip:
                 self._go_on(live[slot], (answer, answer.sets_changed))
         self._end_increments(live)
 
+    def _aim(self, listed: Listed, following: Listed | None) -> None:
+        """Find where an iteration goes; it starts at the trial states."""
+        self.equations.targets(listed, self.linear.change, CHANGE, following=following)
+        self._start.copy_slots(self._trial, listed.slots)
+
+    def _move(self, listed: Listed, renewing: Listed | None) -> None:
+        """Go a share of the way, and evaluate the forces there."""
+        change, pressure_change = self.linear.change, self.linear.pressure_change
+        self.equations.move(
+            self._trial, self._start, listed, change, CHANGE, self._fractions, pressure_change
+        )
+        self._balance(listed, renewing, listed)
+
     def _end_increments(self, live: dict[int, _Live]) -> None:
         """Serve what ends an increment: snaps, the new solution, and the steps that are kept."""
         for slot in self._asking(live, MovesIn):
             self._go_on(live[slot], self._moves_in(slot, live[slot]))
         if slots := self._asking(live, Accept):
             listed = self.equations.listed(np.array(slots))
-            self._before.copy_slots(self._now, listed.slots)
-            self._now.copy_slots(self._trial, listed.slots)
-            self.equations.update_anchors(self._now, listed)
+            self._sequences(listed.slots, self._accept, listed)
             for slot in slots:
                 live[slot].accepted = live[slot].pose
                 self._go_on(live[slot], None)
@@ -376,6 +393,12 @@ class BatchedFingertip:
             self._keep_steps(slots, live)
             for slot in slots:
                 self._go_on(live[slot], None)
+
+    def _accept(self, listed: Listed) -> None:
+        """Take trial states for solutions."""
+        self._before.copy_slots(self._now, listed.slots)
+        self._now.copy_slots(self._trial, listed.slots)
+        self.equations.update_anchors(self._now, listed)
 
     def _moves_in(self, slot: int, one: _Live) -> bool:
         """Whether the indenter moves in from the last solution; rare, so on the CPU."""

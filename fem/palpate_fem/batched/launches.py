@@ -1,6 +1,6 @@
 """Launches that are kept: to pack twenty arguments takes longer than many a kernel.
 
-For few slots even that is too slow: there, on a GPU, a sequence of launches is kept as a graph.
+For one slot even that is too slow: there, on a GPU, a sequence of launches is kept as a graph.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from palpate_fem.batched.dense_tiles import THREADS
 KEPT = 2000
 """Launches that are kept: several times those of a sweep."""
 
-GRAPHS_UP_TO = 8
-"""Slots up to which sequences are graphs: with more, kernels take longer than their launches."""
+KEPT_GRAPHS = 500
+"""Graphs that are kept: of a slot on its own it takes about ten."""
 
 
 class Launches:
@@ -81,38 +81,41 @@ class Launches:
 
 
 class Sequences:
-    """Sequences of launches for lists of slots, those for few of them as graphs on a GPU."""
+    """Runs functions that do nothing but launch; for one slot on a GPU, as graphs."""
 
     def __init__(self, device: str) -> None:
-        self._device = device
-        self._graphs: dict[Any, tuple[wp.Graph, wp.array] | None] = {}
+        self._device = wp.get_device(device)
+        self._graphs: dict[Any, tuple[wp.Graph | None, Any]] = {}
 
-    def __call__(self, known: Any, slots: wp.array, launch: Callable[[wp.array], None]) -> None:
-        """Launch a sequence.
+    def __call__(
+        self, slots: wp.array, launch: Callable[..., object], *arguments: Any, **named: Any
+    ) -> None:
+        """Run a function.
 
         Args:
-            known: What tells it from others; the number of slots does so, too.
-            slots: A list, (m,) int32.
-            launch: Launches it for a list. It must do nothing else, wait for nothing, and launch
-                the same for all lists of one length.
+            slots: Those it launches for; a graph is made and used where it is one.
+            launch: It must do nothing else, wait for nothing, and launch the same with the same
+                arguments, whose contents may change. A graph may hold others that it calls.
+            arguments: Of the function.
+            named: Of the function.
         """
-        count = len(slots)
-        if not slots.device.is_cuda or not 0 < count <= GRAPHS_UP_TO:
-            launch(slots)
+        if len(slots) != 1 or not self._device.is_cuda or self._device.is_capturing:
+            launch(*arguments, **named)
             return
-        key = (known, count)
+        of = [*arguments, *(part for pair in sorted(named.items()) for part in pair)]
+        key = (launch, *((one if isinstance(one, int | float | str) else id(one)) for one in of))
         if key not in self._graphs:  # the first time it compiles what it needs
-            launch(slots)
-            self._graphs[key] = None
+            launch(*arguments, **named)
+            if len(self._graphs) == KEPT_GRAPHS:
+                self._graphs.clear()
+            self._graphs[key] = None, of  # kept, so that no other gets an id of these
             return
-        kept = self._graphs[key]
-        if kept is None:
-            listed = wp.zeros_like(slots)
+        graph, _ = self._graphs[key]
+        if graph is None:
             with wp.ScopedCapture(self._device) as capture:
-                launch(listed)
-            kept = self._graphs[key] = capture.graph, listed
-        graph, listed = kept
-        wp.copy(listed, slots)
+                launch(*arguments, **named)
+            graph = capture.graph
+            self._graphs[key] = graph, of
         wp.capture_launch(graph)
 
 

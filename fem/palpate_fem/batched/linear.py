@@ -16,7 +16,7 @@ from palpate_fem.batched import kernels
 from palpate_fem.batched.dense_tiles import THREADS
 from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.factor import BatchedFactor
-from palpate_fem.batched.launches import Launches
+from palpate_fem.batched.launches import Launches, Sequences
 from palpate_fem.batched.state import BatchedState, Listed
 
 Flags = NDArray[np.bool_]
@@ -41,7 +41,7 @@ class BatchedLinearSystem:
         pattern, device = equations.system.pattern, equations.device
         slots = equations.slots
         self.equations = equations
-        self._launch = Launches(device)
+        self._launch, self._sequences = Launches(device), Sequences(device)
         self._size = len(pattern.free)
         self.factor = BatchedFactor(
             pattern.indptr, pattern.indices, pattern.free // 3, slots=slots, device=device
@@ -72,12 +72,18 @@ class BatchedLinearSystem:
         Returns:
             Whether each is positive definite, (m,).
         """
-        self.equations.tangent(
-            state, listed, self.factor.values, elastic=elastic, viscosity=viscosity
+        self._sequences(
+            listed.slots, self._factorise, state, listed, elastic=elastic, viscosity=viscosity
         )
-        self.factor.factorise(listed.slots)
         self._has_border[listed.numbers] = False
         return np.asarray(self.factor.bad.numpy()[listed.numbers] == 0)
+
+    def _factorise(
+        self, state: BatchedState, listed: Listed, elastic: Listed | None, viscosity: wp.array
+    ) -> None:
+        values = self.factor.values
+        self.equations.tangent(state, listed, values, elastic=elastic, viscosity=viscosity)
+        self.factor.factorise(listed.slots)
 
     def solve(
         self,
@@ -95,23 +101,29 @@ class BatchedLinearSystem:
             missing_m3: Volume that each cavity lacks [m^3], (m,).
             following: Those of the slots whose gaps' offsets follow the change.
         """
+        new = listed.numbers[~self._has_border[listed.numbers]]
+        fresh = listed if len(new) == len(listed.numbers) else self.equations.listed(new)
+        self._has_border[new] = True
+        missing = np.zeros(self.equations.slots)
+        missing[listed.numbers] = missing_m3
+        self._missing.assign(missing)
+        self._sequences(listed.slots, self._solve, state, listed, fresh, following)
+
+    def _solve(
+        self, state: BatchedState, listed: Listed, fresh: Listed, following: Listed | None
+    ) -> None:
+        """Solve; ``fresh`` are those whose border has to be solved for."""
         equations, slots = self.equations, listed.slots
         equations.right_hand_side(state, listed, self.change, CHANGE)
-        new = listed.numbers[~self._has_border[listed.numbers]]
-        if len(new):
+        if len(fresh.numbers):
             # With those whose border's solution is known, too: one factor's tiles serve two lanes.
             equations.volume_gradient(listed, self.change, MORE)
-            fresh = listed if len(new) == len(listed.numbers) else equations.listed(new)
             self._copy(fresh, self.change, MORE, self._border, GRADIENT)
             self.factor.solve(slots, self.change, 2)
             self._copy(fresh, self.change, MORE, self._border, ANSWER)
             self._product(fresh, self._border, GRADIENT, self._border, ANSWER, self._stiffness)
-            self._has_border[new] = True
         else:
             self.factor.solve(slots, self.change, 1)
-        missing = np.zeros(equations.slots)
-        missing[listed.numbers] = missing_m3
-        self._missing.assign(missing)
         self.pressure_change.zero_()
         self._seal(listed)
         # (S + U) x = S answer + coupled, by one correction.
