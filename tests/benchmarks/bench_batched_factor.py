@@ -3,7 +3,8 @@
     python tests/benchmarks/bench_batched_factor.py --slots 1 16 64 192 --out factor.json
 
 The pattern is that of the twin's mesh, the matrices are diagonally dominant; every front is worked
-on, as in the first factorisation of a press. Two right-hand sides.
+on, as in the first factorisation of a press. Two right-hand sides. One slot's launches are a graph,
+whose kernels are not timed.
 """
 
 from __future__ import annotations
@@ -72,9 +73,10 @@ def measure(pattern: Any, slots: int, device: str) -> dict[str, Any]:
         factor.factorise(every)
         put(one)
 
-    anew()
-    factor.factorise(every)
-    factor.solve(every, vectors, 2)
+    for _ in range(2):  # what one slot's launches are kept as is made the second time
+        anew()
+        factor.factorise(every)
+        factor.solve(every, vectors, 2)
     anew()
     factor_launch, factor_ms = timed(lambda: factor.factorise(every))
     solve_launch, solve_ms = timed(lambda: factor.solve(every, vectors, 2))

@@ -25,7 +25,7 @@ TILE = 32
 LANES = 2
 """Vectors that are multiplied together."""
 
-INVERTED = 8
+INVERTED = 12
 """Tiles along a side of the triangles on a front's diagonal that are kept inverted.
 
 What such a triangle is multiplied with is solved for at once; the next triangle waits for it.
