@@ -57,7 +57,7 @@ def outcomes(run: dict[str, Any]) -> str:
 
 def processes(run: dict[str, Any]) -> str:
     """How many processes shared the device, and what is to be said of the run."""
-    remarks = [name for key, name in (("mps", "MPS"), ("kept", "kept")) if run.get(key)]
+    remarks = [name for key, name in (("mps", "MPS"), ("before", "before")) if run.get(key)]
     return ", ".join([str(run.get("together", 1)), *remarks])
 
 
@@ -199,7 +199,7 @@ def main() -> None:
     report, meshes = read("slots.json"), read("meshes.json")
     factor, sweeps = read("factor.json"), read("sweeps.json")
     runs = report["runs"] + meshes["runs"]
-    draw([run for run in runs if "together" not in run], FOLDER / "time.png")
+    draw([run for run in runs if not run.get("before")], FOLDER / "time.png")
     sections = [
         HEAD,
         f"## Time\n\n{report['device']}: `{report['command']}` and `{meshes['command']}`. "
