@@ -198,8 +198,10 @@ def test_labelled_presses_correct_what_is_wrong_near_them(
 
 
 def test_a_held_out_press_is_estimated_as_if_it_had_not_been_labelled(
-    model: ForceTransfer,
+    model: ForceTransfer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """But for the weight of the line, which follows from all of them."""
+    monkeypatch.setattr(transfer, "_line_weight", lambda *_: 0.3)
     one = finger(2).recording
     estimate = model.estimate(one, unlabelled=False)
     rows = np.concatenate([np.arange(at, at + 200, 20) for at in (0, 600, 1200)])
@@ -230,6 +232,23 @@ def test_presses_of_a_finger_like_the_others_do_not_change_its_scale(
     found = model.correct(one, estimate, labelled)
     monkeypatch.setattr(transfer, "LIKELIER", np.inf)
     np.testing.assert_array_equal(found.force, model.correct(one, estimate, labelled).force)
+
+
+@pytest.mark.parametrize("presses", [2, 6])
+def test_where_the_line_is_right_and_the_processes_are_not_it_is_believed(
+    model: ForceTransfer, presses: int
+) -> None:
+    """The more, the more presses say so; after one press alone nothing can."""
+    one = finger(2).recording
+    turned = model.estimate(one, unlabelled=False)[:, [1, 0, 2]]  # x for y
+    starts = np.linspace(0, ROWS - 200, presses).astype(int)
+    rows = np.concatenate([np.arange(at, at + 200, 10) for at in starts])
+    labelled = LabelledPresses(rows, np.repeat(np.arange(presses), 20))
+    by_both = model.correct(one, turned, labelled).force
+    first = labelled.where(labelled.press == 0)
+    by_one = model.correct(one, turned, first).force
+    error, of_one = (np.linalg.norm(one.force - each, axis=1).mean() for each in (by_both, by_one))
+    assert error < (0.4 if presses == 6 else 0.8) * of_one
 
 
 def test_without_a_press_an_unlike_finger_is_estimated_no_worse_than_by_a_constant() -> None:

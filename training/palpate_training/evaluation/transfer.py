@@ -21,15 +21,16 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate_training.datasets.container import add_array
 from palpate_training.datasets.features import FeatureDataset
-from palpate_training.learning.baselines import ridge
 from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.metrics import force_errors
 from palpate_training.learning.twin_line import TwinLine
 from palpate_training.systems.transfer import (
     ALIKE,
+    LINE_VALIDATION,
     FingerRecording,
     ForceTransfer,
     LabelledPresses,
+    line_through,
 )
 
 Floats = npt.NDArray[np.float64]
@@ -57,8 +58,6 @@ FLOOR_N = 1.0
 
 PRESSES_OF_OTHERS = 5
 """As many labelled presses count as much as the other fingers where intervals are made."""
-
-_VALIDATION = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,22 +318,11 @@ def baselines_of(
     The constant is the mean of what is known of the tested finger, else of the others. The
     regression knows both; labelled rows count as much as all others together.
     """
-    parts: list[tuple[Floats, Floats]] = []
-    ends: list[tuple[Floats, Floats]] = []
-    for finger in train:
-        border = round(len(finger.tared) * (1.0 - _VALIDATION))
-        force, tared = finger.recording.force, finger.tared.astype(np.float64)
-        parts.append((tared[:border], force[:border]))
-        ends.append((tared[border:], force[border:]))
     known = test.recording.force[labelled]
-    mean = known.mean(axis=0) if len(labelled) else np.vstack([y for _, y in parts]).mean(axis=0)
-    if len(labelled):
-        own = test.tared[labelled].astype(np.float64)
-        times = max(1, sum(len(x) for x, _ in parts) // len(own))
-        parts.append((np.tile(own, (times, 1)), np.tile(known, (times, 1))))
-    x, y = (np.vstack(columns) for columns in zip(*parts, strict=True))
-    x_end, y_end = (np.vstack(columns) for columns in zip(*ends, strict=True))
-    line = ridge(x, y, x_end, y_end)
+    others = [(finger.tared.astype(np.float64), finger.recording.force) for finger in train]
+    learned = [force[: round(len(force) * (1.0 - LINE_VALIDATION))] for _, force in others]
+    mean = known.mean(axis=0) if len(labelled) else np.vstack(learned).mean(axis=0)
+    line = line_through(others, (test.tared[labelled].astype(np.float64), known))
     return {
         "constant": np.tile(mean, (len(tested), 1)),
         "ridge": line.predict(test.tared[tested]),

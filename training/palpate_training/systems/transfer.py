@@ -11,15 +11,17 @@ From a finger's electrodes *without* forces comes more about the direction: a re
 spread, electrode by electrode, take the place of the other fingers'. From a few *labelled* presses
 comes a correction that reaches as far as what was pressed, by the common mode, too, and of all that
 lies some seconds before and after them, as baselines wander. Where these presses say that the
-finger is far more or less sensitive than the others, its estimates are scaled first.
+finger is far more or less sensitive than the others, its estimates are scaled first. From two
+presses on a line through the rows of all fingers, corrected in the same way, is mixed in, as far as
+these presses say, each estimated without itself.
 
 The magnitude's processes start from a line through the presses of a simulated population, mapped to
 real fingers by what was learned on the others (``TwinLine``); what they learn is what that line
 leaves. A network of the population helped in no way that was tried (training/LOG.md).
 
 All constants were chosen on the two fingers of the LASA force calibration, in both directions, the
-worse counting, and then frozen; those for fingers that are unlike the others, on four simulated
-ones, too (training/LOG.md).
+worse counting, and then frozen; those for fingers that are unlike the others, and for the line, on
+simulated ones, too (training/LOG.md).
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.signal import lfilter
 
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
+from palpate_training.learning.baselines import AffineModel, ridge
 from palpate_training.learning.electrode_nets import MIRROR_AXES
 from palpate_training.learning.twin_line import TwinLine
 from palpate_training.systems.samples import impedance_ohm
@@ -131,6 +134,12 @@ LIKELIER = 10.0
 CLEARLY_BETTER = 0.8
 """Where several presses are labelled: share that it must leave, at most, of their error when each
 is estimated without itself."""
+
+LINE_WEIGHT, BELIEVED_PRESSES = 0.5, 4.0
+"""What is believed of the line's weight before, and how many labelled presses tell as much."""
+
+LINE_VALIDATION = 0.2
+"""Share of each training finger's rows, its last ones, on which the line's penalty is chosen."""
 
 ALIKE = 2.0
 """Mean impedance at rest of a finger over that of another one, up to which they are taken for
@@ -356,7 +365,7 @@ class ForceTransfer:
         """Correct estimates by labelled presses of the same finger.
 
         Where these presses say that the finger is far more or less sensitive than the others, the
-        estimates are scaled first.
+        estimates are scaled first. With several presses the line has its share.
 
         Args:
             recording: With the forces of the labelled rows; no others are looked at.
@@ -364,6 +373,48 @@ class ForceTransfer:
             labelled: Which rows.
         """
         rows = self._scale.apply(recording, CORRECTION_INPUTS, np.arange(len(estimate)))
+        found = self._scaled(recording, rows, estimate, labelled)
+        if len(np.unique(labelled.press)) == 1:
+            return found  # nothing tells what the line is worth
+        line = self._by_line(recording, rows, labelled)
+        weight = _line_weight(recording.force[labelled.rows], found, line, labelled)
+        return CorrectedForces(
+            (1.0 - weight) * found.force + weight * line.force,
+            (1.0 - weight) * found.held_out + weight * line.held_out,
+        )
+
+    def _by_line(
+        self, recording: FingerRecording, rows: Floats, labelled: LabelledPresses
+    ) -> CorrectedForces:
+        """The same by a ridge regression that knows the labelled rows, corrected by them."""
+        inputs = _logarithms(recording)
+
+        def estimate(known: LabelledPresses) -> Floats:
+            some = inputs[known.rows], recording.force[known.rows]
+            return line_through(self._line_rows, some).predict(inputs)
+
+        force = _ErrorProcess(recording, rows, labelled).force(estimate(labelled))
+        held_out = np.empty((len(labelled.rows), 3))
+        for press in np.unique(labelled.press):
+            own = labelled.press == press
+            others = labelled.where(~own)
+            process = _ErrorProcess(recording, rows, others)
+            held_out[own] = process.force(estimate(others), labelled.rows[own])
+        return CorrectedForces(force, held_out)
+
+    @cached_property
+    def _line_rows(self) -> list[tuple[Floats, Floats]]:
+        """Inputs of the line and forces, of each training finger."""
+        return [(_logarithms(source), source.force) for source in self._sources]
+
+    def _scaled(
+        self,
+        recording: FingerRecording,
+        rows: Floats,
+        estimate: Floats,
+        labelled: LabelledPresses,
+    ) -> CorrectedForces:
+        """Scale estimates where presses say so, and correct them."""
         process = _ErrorProcess(recording, rows, labelled)
         held_out = process.held_out(estimate)
         scaled = process.scale(estimate) * estimate
@@ -385,6 +436,43 @@ class ForceTransfer:
                 return CorrectedForces(process.force(estimate), held_out)
             held_out = without
         return CorrectedForces(process.force(scaled), held_out)
+
+
+def _logarithms(recording: FingerRecording) -> Floats:
+    """Of the impedance over that at rest, the common mode included, shape (N, 19)."""
+    return recording.parts(Inputs((), common=1.0))[0]
+
+
+def line_through(
+    others: Sequence[tuple[Floats, Floats]], known: tuple[Floats, Floats]
+) -> AffineModel:
+    """A ridge regression; labelled rows count as much as all others together.
+
+    Args:
+        others: Inputs (N, I) and forces (N, 3) of each training finger, in order of time.
+        known: Those of the labelled rows; there may be none.
+    """
+    ends = [round(len(force) * (1.0 - LINE_VALIDATION)) for _, force in others]
+    parts = [(x[:end], y[:end]) for (x, y), end in zip(others, ends, strict=True)]
+    last = [(x[end:], y[end:]) for (x, y), end in zip(others, ends, strict=True)]
+    times = max(1, sum(ends) // max(1, len(known[1])))
+    parts.append((np.tile(known[0], (times, 1)), np.tile(known[1], (times, 1))))
+    rows, last_rows = (
+        [np.vstack(one) for one in zip(*some, strict=True)] for some in (parts, last)
+    )
+    return ridge(*rows, *last_rows)
+
+
+def _line_weight(
+    known: Floats, found: CorrectedForces, line: CorrectedForces, labelled: LabelledPresses
+) -> float:
+    """Share of the line that leaves the least squares of held-out errors, with what is believed."""
+    apart = line.held_out - found.held_out
+    size = float(np.mean(np.square(apart)))
+    gain = float(np.mean(apart * (known - found.held_out)))
+    presses = len(np.unique(labelled.press))
+    told = presses * gain + BELIEVED_PRESSES * LINE_WEIGHT * size
+    return float(np.clip(told / max((presses + BELIEVED_PRESSES) * size, 1e-12), 0.0, 1.0))
 
 
 class _ErrorProcess:
