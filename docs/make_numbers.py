@@ -103,7 +103,9 @@ def _fem() -> Iterator[Claim]:
         "four {ms192xxxmb} (one {ms192b})",
         figures,
     )
-    yield Claim("docs/twin.md", "{ms192xb} ms a press instead of {ms192b}, and {ms192xmb}\n", figures)
+    yield Claim(
+        "docs/twin.md", "{ms192xb} ms a press instead of {ms192b}, and {ms192xmb}\n", figures
+    )
 
 
 def _name_of(run: dict[str, Any]) -> str:

@@ -205,7 +205,8 @@ networks of the [study](study.md) have 0.085 and 0.33 N):
   flattered; a third finger would be a test.
 * A single press makes the magnitude of the first finger worse. From two presses on a ridge
   regression, corrected in the same way, has its share, as large as presses that are left out say:
-  magnitudes gain by it, the first finger's direction with five presses does not (0.071 rad without).
+  magnitudes gain by it, the first finger's direction with five presses does not (0.071 rad
+  without).
 * The errors that are left are mostly slow: baselines that wander within half a minute.
 * The intervals come from the other finger's halves, which differ less than fingers do, and the more
   from the labelled presses, each estimated without itself, the more there are.
