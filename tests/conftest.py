@@ -11,6 +11,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import signal
 import socket
 import threading
 import time
@@ -51,6 +52,10 @@ PORTS = range(20_000, 32_000)
 # No example has a time limit: first calls import and compile, and machines here are noisy.
 settings.register_profile("palpate", deadline=None)
 settings.load_profile("palpate")
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell's background job ignores Ctrl-C, and so would the programs that tests interrupt.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # readline, which pytest loads, sets it for child processes, and consoles made at import time
