@@ -656,3 +656,9 @@ def invert_triangle(
     Its diagonal tiles are inverted. All threads of a block call it.
     """
     ...
+
+
+@wp.func
+def end_of(corner: int, own: int):
+    """First tile after a triangle on the diagonal that begins at tile ``corner``."""
+    return wp.min(corner + wp.static(INVERTED), own)

@@ -28,28 +28,18 @@ _VECTORS = (
     auto number = [=](const double* from, int k) { return row < 2 ? from[2 * k + row] : 0.0; };
     // Write what the warps have found: their sums stand at the threads with column 0.
     auto finish = [=](const double (&sum)[4][2], auto place_of) {
-        auto put = [=](int place, double value) {
-            result[place] = subtract ? result[place] - value : value;
-        };
-        if constexpr (parts == 1) {
-            if (column == 0)
-                for (int m = 0; m < 4; ++m)
-                    for (int n = 0; n < 2; ++n)
-                        put(place_of(m) + n, sum[m][n]);
-        } else {
-            __shared__ double shared[WP_TILE_BLOCK_DIM / 32][64];
-            double(*mine)[64] = shared + threadIdx.x / 32 - part;
-            if (column == 0)
-                for (int m = 0; m < 4; ++m)
-                    for (int n = 0; n < 2; ++n)
-                        mine[part][place_of(m) + n] = sum[m][n];
-            __syncthreads();
-            for (int i = thread; i < 64; i += 32 * parts) {
-                double total = 0.0;
-                for (int p = 0; p < parts; ++p)
-                    total += mine[p][i];
-                put(i, total);
-            }
+        __shared__ double shared[WP_TILE_BLOCK_DIM / 32][64];
+        double(*mine)[64] = shared + threadIdx.x / 32 - part;
+        if (column == 0)
+            for (int m = 0; m < 4; ++m)
+                for (int n = 0; n < 2; ++n)
+                    mine[part][place_of(m) + n] = sum[m][n];
+        __syncthreads();
+        for (int i = thread; i < 64; i += 32 * parts) {
+            double total = 0.0;
+            for (int p = 0; p < parts; ++p)
+                total += mine[p][i];
+            result[i] = subtract ? result[i] - total : total;
         }
     };
 #endif

@@ -297,29 +297,28 @@ class BatchedFactor:
                 [self._begun, self._loaded],
             )  # fmt: skip
             for step in self._steps[level]:
-                corner, fronts = step.corner, [self._fronts, self._loaded]
-                self._over_tiles(
-                    solve_kernels.multiply_rows, slots, step.own, fronts, corner,
-                    self._begun, self._half,
-                )  # fmt: skip
-                self._over_tiles(
-                    solve_kernels.subtract_rows, slots, step.below, fronts, corner,
-                    self._half, self._begun,
-                )  # fmt: skip
+                place = [self._fronts, self._loaded]
+                for listed, subtract, between in (
+                    (step.own, 0, (self._begun, self._half)),
+                    (step.below, 1, (self._half, self._begun)),
+                ):
+                    self._over_tiles(
+                        solve_kernels.solve_rows, slots, listed, place, step.corner, subtract,
+                        *between,
+                    )  # fmt: skip
         for level in reversed(range(tiles.levels)):
             self._over_fronts(
                 solve_kernels.gather_answers, level, slots, [self._row_links], [], [self._begun]
             )
             for step in reversed(self._steps[level]):
-                corner, fronts = step.corner, [self._fronts]
-                self._over_tiles(
-                    solve_kernels.subtract_columns, slots, step.own, fronts, corner,
-                    self._begun, self._half,
-                )  # fmt: skip
-                self._over_tiles(
-                    solve_kernels.multiply_columns, slots, step.own, fronts, corner,
-                    self._half, self._begun,
-                )  # fmt: skip
+                for subtract, between in (
+                    (1, (self._begun, self._half)),
+                    (0, (self._half, self._begun)),
+                ):
+                    self._over_tiles(
+                        solve_kernels.solve_columns, slots, step.own, [self._fronts], step.corner,
+                        subtract, *between,
+                    )  # fmt: skip
         self._launch(
             solve_kernels.scatter_solution,
             (len(slots), lanes, self.size),
@@ -352,7 +351,8 @@ class BatchedFactor:
         listed: tuple[int, int],
         plan: list[Any],
         corner: int,
-        known: wp.array,
+        subtract: int,
+        source: wp.array,
         out: wp.array,
     ) -> None:
         """Launch a kernel for listed rows or columns of tiles."""
@@ -360,8 +360,8 @@ class BatchedFactor:
         self._launch(
             kernel,
             (len(slots), last - first, TILE * PARTS),
-            [slots, self._tile_rows, *plan, first, corner, tiles.panel_tiles, tiles.rows,
-             self._panels, known],
+            [slots, self._tile_rows, *plan, first, corner, subtract, tiles.panel_tiles,
+             tiles.rows, self._panels, source],
             [out],
         )  # fmt: skip
 

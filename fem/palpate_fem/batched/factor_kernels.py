@@ -17,7 +17,7 @@ from __future__ import annotations
 import warp as wp
 
 from palpate_fem.batched import dense_tiles
-from palpate_fem.batched.dense_tiles import INVERTED, THREADS, WIDE
+from palpate_fem.batched.dense_tiles import THREADS, WIDE
 
 wp.set_module_options({"enable_backward": False})
 
@@ -252,5 +252,5 @@ def invert_triangles(
         own = fronts[front, 0]
         dense_tiles.invert_triangle(
             panels, slot * panel_tiles + fronts[front, 4], own, corner,
-            wp.min(corner + wp.static(INVERTED), own), thread,
+            dense_tiles.end_of(corner, own), thread,
         )  # fmt: skip

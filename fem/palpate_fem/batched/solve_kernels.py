@@ -13,7 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from palpate_fem.batched import dense_vectors
-from palpate_fem.batched.dense_tiles import INVERTED, TILE
+from palpate_fem.batched.dense_tiles import TILE, end_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,64 +59,37 @@ def gather_loads(
             loaded[slot, front] = 1
 
 
-@wp.func
-def end_of(corner: int, own: int):
-    """First tile after a triangle along the diagonal."""
-    return wp.min(corner + wp.static(INVERTED), own)
-
-
 @wp.kernel
-def multiply_rows(
+def solve_rows(
     slots: wp.array(dtype=wp.int32),
     listed: wp.array2d(dtype=wp.int32),
     fronts: wp.array2d(dtype=wp.int32),
     loaded: wp.array2d(dtype=wp.int32),
     first: int,
     corner: int,
+    subtract: int,
     panel_tiles: int,
     rows: int,
     panels_in: wp.array3d(dtype=wp.float64),
-    begun_in: wp.array2d(dtype=wp.float64),
-    half: wp.array2d(dtype=wp.float64),
+    source: wp.array2d(dtype=wp.float64),
+    out: wp.array2d(dtype=wp.float64),
 ):
-    """Solve with inverse triangles that begin at tile ``corner``: a row of tiles each."""
-    i, number, thread = wp.tid()
-    slot = slots[i]
-    front = listed[first + number, 0]
-    r = listed[first + number, 1]
-    begin = slot * rows + fronts[front, 6]
-    last = wp.where(loaded[slot, front] != 0, r + 1, corner)
-    dense_vectors.multiply_row(
-        panels_in, slot * panel_tiles + fronts[front, 4], fronts[front, 0], r, corner, last,
-        begun_in, begin, half, begin + wp.static(TILE) * r, 0, thread,
-    )  # fmt: skip
+    """Solve with inverse triangles that begin at tile ``corner``: a row of tiles each.
 
-
-@wp.kernel
-def subtract_rows(
-    slots: wp.array(dtype=wp.int32),
-    listed: wp.array2d(dtype=wp.int32),
-    fronts: wp.array2d(dtype=wp.int32),
-    loaded: wp.array2d(dtype=wp.int32),
-    first: int,
-    corner: int,
-    panel_tiles: int,
-    rows: int,
-    panels_in: wp.array3d(dtype=wp.float64),
-    half_in: wp.array2d(dtype=wp.float64),
-    begun: wp.array2d(dtype=wp.float64),
-):
-    """Subtract what these triangles are solved for from the rows below them."""
+    Or subtract what they are solved for from the rows below them.
+    """
     i, number, thread = wp.tid()
     slot = slots[i]
     front = listed[first + number, 0]
     r = listed[first + number, 1]
     own = fronts[front, 0]
     begin = slot * rows + fronts[front, 6]
-    last = wp.where(loaded[slot, front] != 0, end_of(corner, own), corner)
+    last = corner
+    if loaded[slot, front] != 0:
+        last = wp.where(subtract != 0, end_of(corner, own), r + 1)
     dense_vectors.multiply_row(
         panels_in, slot * panel_tiles + fronts[front, 4], own, r, corner, last,
-        half_in, begin, begun, begin + wp.static(TILE) * r, 1, thread,
+        source, begin, out, begin + wp.static(TILE) * r, subtract, thread,
     )  # fmt: skip
 
 
@@ -143,55 +116,34 @@ def gather_answers(
 
 
 @wp.kernel
-def subtract_columns(
+def solve_columns(
     slots: wp.array(dtype=wp.int32),
     listed: wp.array2d(dtype=wp.int32),
     fronts: wp.array2d(dtype=wp.int32),
     first: int,
     corner: int,
+    subtract: int,
     panel_tiles: int,
     rows: int,
     panels_in: wp.array3d(dtype=wp.float64),
-    begun_in: wp.array2d(dtype=wp.float64),
-    half: wp.array2d(dtype=wp.float64),
+    source: wp.array2d(dtype=wp.float64),
+    out: wp.array2d(dtype=wp.float64),
 ):
-    """Subtract what the rows below a triangle give from its own: a column of tiles each."""
+    """Solve with transposed inverse triangles: a column of tiles each.
+
+    Or subtract, before, what the rows below a triangle give from its own.
+    """
     i, number, thread = wp.tid()
     slot = slots[i]
     front = listed[first + number, 0]
     c = listed[first + number, 1]
     own = fronts[front, 0]
     begin = slot * rows + fronts[front, 6]
+    end = end_of(corner, own)
     dense_vectors.multiply_column(
         panels_in, slot * panel_tiles + fronts[front, 4], own, c,
-        end_of(corner, own), fronts[front, 1],
-        begun_in, begin, half, begin + wp.static(TILE) * c, 1, thread,
-    )  # fmt: skip
-
-
-@wp.kernel
-def multiply_columns(
-    slots: wp.array(dtype=wp.int32),
-    listed: wp.array2d(dtype=wp.int32),
-    fronts: wp.array2d(dtype=wp.int32),
-    first: int,
-    corner: int,
-    panel_tiles: int,
-    rows: int,
-    panels_in: wp.array3d(dtype=wp.float64),
-    half_in: wp.array2d(dtype=wp.float64),
-    begun: wp.array2d(dtype=wp.float64),
-):
-    """Solve with transposed inverse triangles: a column of tiles each."""
-    i, number, thread = wp.tid()
-    slot = slots[i]
-    front = listed[first + number, 0]
-    c = listed[first + number, 1]
-    own = fronts[front, 0]
-    begin = slot * rows + fronts[front, 6]
-    dense_vectors.multiply_column(
-        panels_in, slot * panel_tiles + fronts[front, 4], own, c, c, end_of(corner, own),
-        half_in, begin, begun, begin + wp.static(TILE) * c, 0, thread,
+        wp.where(subtract != 0, end, c), wp.where(subtract != 0, fronts[front, 1], end),
+        source, begin, out, begin + wp.static(TILE) * c, subtract, thread,
     )  # fmt: skip
 
 

@@ -12,8 +12,8 @@ spread, electrode by electrode, take the place of the other fingers'. From a few
 comes a correction that reaches as far as what was pressed, by the common mode, too, and of all that
 lies some seconds before and after them, as baselines wander. Where these presses say that the
 finger is far more or less sensitive than the others, its estimates are scaled first. From two
-presses on a line through the rows of all fingers, corrected in the same way, is mixed in, as far as
-these presses say, each estimated without itself.
+presses on, a line through the rows of all fingers, corrected in the same way, has a share. The
+share is the one that estimates each of these presses best without itself.
 
 The magnitude's processes start from a line through the presses of a simulated population, mapped to
 real fingers by what was learned on the others (``TwinLine``); what they learn is what that line
@@ -26,7 +26,7 @@ simulated ones, too (training/LOG.md).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -373,69 +373,53 @@ class ForceTransfer:
             labelled: Which rows.
         """
         rows = self._scale.apply(recording, CORRECTION_INPUTS, np.arange(len(estimate)))
-        found = self._scaled(recording, rows, estimate, labelled)
-        if len(np.unique(labelled.press)) == 1:
+        process = _ErrorProcess(recording, rows, labelled)
+        found = _scaled(process, estimate)
+        if len(process.presses) == 1:
             return found  # nothing tells what the line is worth
-        line = self._by_line(recording, rows, labelled)
-        weight = _line_weight(recording.force[labelled.rows], found, line, labelled)
+        line = self._by_line(recording, process)
+        weight = _line_weight(process, found, line)
         return CorrectedForces(
             (1.0 - weight) * found.force + weight * line.force,
             (1.0 - weight) * found.held_out + weight * line.held_out,
         )
 
-    def _by_line(
-        self, recording: FingerRecording, rows: Floats, labelled: LabelledPresses
-    ) -> CorrectedForces:
+    def _by_line(self, recording: FingerRecording, process: _ErrorProcess) -> CorrectedForces:
         """The same by a ridge regression that knows the labelled rows, corrected by them."""
         inputs = _logarithms(recording)
 
-        def estimate(known: LabelledPresses) -> Floats:
-            some = inputs[known.rows], recording.force[known.rows]
-            return line_through(self._line_rows, some).predict(inputs)
+        def estimate(known: _ErrorProcess) -> Floats:
+            rows = known.labelled.rows
+            line = line_through(self._line_rows, (inputs[rows], recording.force[rows]))
+            return line.predict(inputs)
 
-        force = _ErrorProcess(recording, rows, labelled).force(estimate(labelled))
-        held_out = np.empty((len(labelled.rows), 3))
-        for press in np.unique(labelled.press):
-            own = labelled.press == press
-            others = labelled.where(~own)
-            process = _ErrorProcess(recording, rows, others)
-            held_out[own] = process.force(estimate(others), labelled.rows[own])
-        return CorrectedForces(force, held_out)
+        return CorrectedForces(process.force(estimate(process)), process.without_each(estimate))
 
     @cached_property
     def _line_rows(self) -> list[tuple[Floats, Floats]]:
         """Inputs of the line and forces, of each training finger."""
         return [(_logarithms(source), source.force) for source in self._sources]
 
-    def _scaled(
-        self,
-        recording: FingerRecording,
-        rows: Floats,
-        estimate: Floats,
-        labelled: LabelledPresses,
-    ) -> CorrectedForces:
-        """Scale estimates where presses say so, and correct them."""
-        process = _ErrorProcess(recording, rows, labelled)
-        held_out = process.held_out(estimate)
-        scaled = process.scale(estimate) * estimate
-        # Log evidences differ by the misfits alone: the covariance is the same.
-        if 0.5 * (process.misfit(estimate) - process.misfit(scaled)) <= LIKELIER:
+
+def _scaled(process: _ErrorProcess, estimate: Floats) -> CorrectedForces:
+    """Scale estimates where presses say so, and correct them."""
+
+    def scale(known: _ErrorProcess) -> Floats:
+        return known.scale(estimate) * estimate
+
+    held_out, scaled = process.held_out(estimate), scale(process)
+    # Log evidences differ by the misfits alone: the covariance is the same.
+    if 0.5 * (process.misfit(estimate) - process.misfit(scaled)) <= LIKELIER:
+        return CorrectedForces(process.force(estimate), held_out)
+    if len(process.presses) > 1:
+        without = process.without_each(scale)
+        error, before = (
+            np.median(np.linalg.norm(process.known - each, axis=1)) for each in (without, held_out)
+        )
+        if error >= CLEARLY_BETTER * before:
             return CorrectedForces(process.force(estimate), held_out)
-        presses = np.unique(labelled.press)
-        if len(presses) > 1:
-            known, without = recording.force[labelled.rows], np.empty_like(held_out)
-            for press in presses:
-                own = labelled.press == press
-                others = _ErrorProcess(recording, rows, labelled.where(~own))
-                so_scaled = others.scale(estimate) * estimate
-                without[own] = others.force(so_scaled, labelled.rows[own])
-            error, before = (
-                np.median(np.linalg.norm(known - each, axis=1)) for each in (without, held_out)
-            )
-            if error >= CLEARLY_BETTER * before:
-                return CorrectedForces(process.force(estimate), held_out)
-            held_out = without
-        return CorrectedForces(process.force(scaled), held_out)
+        held_out = without
+    return CorrectedForces(process.force(scaled), held_out)
 
 
 def _logarithms(recording: FingerRecording) -> Floats:
@@ -463,14 +447,12 @@ def line_through(
     return ridge(*rows, *last_rows)
 
 
-def _line_weight(
-    known: Floats, found: CorrectedForces, line: CorrectedForces, labelled: LabelledPresses
-) -> float:
+def _line_weight(process: _ErrorProcess, found: CorrectedForces, line: CorrectedForces) -> float:
     """Share of the line that leaves the least squares of held-out errors, with what is believed."""
     apart = line.held_out - found.held_out
     size = float(np.mean(np.square(apart)))
-    gain = float(np.mean(apart * (known - found.held_out)))
-    presses = len(np.unique(labelled.press))
+    gain = float(np.mean(apart * (process.known - found.held_out)))
+    presses = len(process.presses)
     told = presses * gain + BELIEVED_PRESSES * LINE_WEIGHT * size
     return float(np.clip(told / max((presses + BELIEVED_PRESSES) * size, 1e-12), 0.0, 1.0))
 
@@ -479,10 +461,16 @@ class _ErrorProcess:
     """A Gaussian process of the error of estimates, which is known at labelled rows.
 
     Estimates are of all rows of the recording, shape (N, 3); the labelled ones are M.
+
+    Attributes:
+        labelled: The labelled rows.
+        presses: Numbers of the presses that they belong to.
+        known: Their forces [N], shape (M, 3).
     """
 
     def __init__(self, recording: FingerRecording, rows: Floats, labelled: LabelledPresses) -> None:
-        self._recording, self._rows, self._labelled = recording, rows, labelled
+        self._recording, self._rows, self.labelled = recording, rows, labelled
+        self.presses, self.known = np.unique(labelled.press), recording.force[labelled.rows]
         same = labelled.press[:, None] == labelled.press
         covariance = self._covariance(labelled.rows) + PRESS_VARIANCE_N2 * same
         covariance[np.diag_indices(len(same))] += ROW_VARIANCE_N2
@@ -503,12 +491,25 @@ class _ErrorProcess:
 
     def held_out(self, estimate: Floats) -> Floats:
         """Corrected estimates of the labelled rows, each without its own press, shape (M, 3)."""
-        held_out = self._recording.force[self._labelled.rows].astype(np.float64)
+        held_out = self.known.astype(np.float64)
         weight = self._inverse @ self._error(estimate)
         # What is left of a press when it is left out follows from the inverse alone.
-        for press in np.unique(self._labelled.press):
-            own = self._labelled.press == press
+        for press in self.presses:
+            own = self.labelled.press == press
             held_out[own] -= np.linalg.solve(self._inverse[np.ix_(own, own)], weight[own])
+        return held_out
+
+    def without_each(self, estimate: Callable[[_ErrorProcess], Floats]) -> Floats:
+        """The same where estimates, too, follow from the other presses, shape (M, 3).
+
+        Args:
+            estimate: Makes them from the process of the other presses.
+        """
+        held_out = np.empty((len(self.labelled.rows), 3))
+        for press in self.presses:
+            own = self.labelled.press == press
+            others = _ErrorProcess(self._recording, self._rows, self.labelled.where(~own))
+            held_out[own] = others.force(estimate(others), self.labelled.rows[own])
         return held_out
 
     def scale(self, estimate: Floats) -> float:
@@ -516,18 +517,17 @@ class _ErrorProcess:
 
         By generalised least squares with what is believed before: 1, with `SCALE_VARIANCE`.
         """
-        known = estimate[self._labelled.rows]
+        known = estimate[self.labelled.rows]
         weighted = self._inverse @ known
         information = float(np.sum(known * weighted)) + 1.0 / SCALE_VARIANCE
         return max(LEAST_SCALE, 1.0 + float(np.sum(weighted * self._error(estimate))) / information)
 
     def _error(self, estimate: Floats) -> Floats:
-        rows = self._labelled.rows
-        return np.asarray(self._recording.force[rows] - estimate[rows])
+        return np.asarray(self.known - estimate[self.labelled.rows])
 
     def _covariance(self, some: Rows) -> Floats:
         """Of the errors of some rows with those of the labelled ones, shape (N, M)."""
-        recording, labelled = self._recording, self._labelled.rows
+        recording, labelled = self._recording, self.labelled.rows
         place = CORRECTION_VARIANCE_N2 * CORRECTION(self._rows[some], self._rows[labelled])
         apart_s = recording.period_s * np.abs(some[:, None] - labelled)
         together = recording.segment[some][:, None] == recording.segment[labelled]
