@@ -96,10 +96,10 @@ class BatchedEquations:
         self._volume_gradient = room(wp.vec3d, total, corners)
         self._frozen_gradient = room(wp.vec3d, total, corners)
         self._target = room(wp.float64, total)
-        # Of quadrature points: J, w P and w J F^-T.
+        # Of quadrature points: J, w P and w J F^-T; F, F^-T and scales, of which tangents are made.
         self._stresses = [room(kind, total, points) for kind in (wp.float64, wp.mat33d, wp.mat33d)]
-        self._parts = [room(wp.vec3d, total, points, corners) for _ in range(3)]
-        self._parts.append(room(wp.vec4d, total, points))
+        made_of = wp.mat33d, wp.mat33d, element_kernels.Scales
+        self._deformations = [room(kind, total, points) for kind in made_of]
         self._elastic = room(wp.mat33d, slots * pattern.blocks)
         self._sum = room(wp.mat33d, slots * pattern.blocks)
         self._internal, self._gradient_of_volume, self._unbalanced = (
@@ -190,7 +190,7 @@ class BatchedEquations:
         means = [surface.faces, surface.mortar_shape, surface.weight]
         self._launch(
             mortar_kernels.mean_gaps_to_indenter,
-            len(listed.outer),
+            (len(listed.outer), surface.points),
             [*means, *posed, self._nodes, listed.outer, self._margin, self._hanging,
              state.position, surface.node_gap],
             [surface.outward, surface.held, surface.node_mean],
@@ -208,7 +208,7 @@ class BatchedEquations:
         )
         self._launch(
             mortar_kernels.mean_gaps_to_core,
-            len(listed.inner),
+            (len(listed.inner), surface.points),
             [surface.faces, surface.mortar_shape, surface.weight, *self._core, self._nodes,
              listed.inner, self._margin, state.position, surface.node_gap],
             [surface.outward, surface.node_mean],
@@ -262,7 +262,7 @@ class BatchedEquations:
         place = [self._tip, self._rotation, self._nodes, listed.outer]
         self._launch(
             contact_kernels.indenter_contact,
-            len(listed.outer),
+            (len(listed.outer), outer.points),
             [outer.faces, outer.shape, outer.area, *posed, self._law, self._margin, *place,
              state.position, outer.offset, state.indenter_pressure, state.traction, state.anchor],
             [*outer.results, outer.wanted_traction, outer.traction_slope, outer.coupled,
@@ -272,7 +272,7 @@ class BatchedEquations:
         if mortar:
             self._launch(
                 contact_kernels.mortar_on_indenter,
-                len(listed.outer),
+                (len(listed.outer), outer.points),
                 [outer.faces, outer.mortar_shape, outer.weight, *posed, *place,
                  state.position, state.indenter_pressure, outer.held],
                 [outer.mortar_status, outer.mortar_tangent, outer.force],
@@ -281,7 +281,7 @@ class BatchedEquations:
             place = [*self._core, self._nodes, listed.inner]
             self._launch(
                 contact_kernels.core_contact,
-                len(listed.inner),
+                (len(listed.inner), inner.points),
                 [inner.faces, inner.shape, inner.area, *place, self._core_law, self._core_margin,
                  state.position, inner.offset, state.core_pressure],
                 [*inner.results, inner.force],
@@ -289,7 +289,7 @@ class BatchedEquations:
             if mortar:
                 self._launch(
                     contact_kernels.mortar_on_core,
-                    len(listed.inner),
+                    (len(listed.inner), inner.points),
                     [inner.faces, inner.mortar_shape, inner.weight, *place,
                      state.position, state.core_pressure],
                     [inner.mortar_status, inner.mortar_tangent, inner.force],
@@ -396,16 +396,16 @@ class BatchedEquations:
                 [self._elastic],
             )
             self._launch(
-                element_kernels.point_state,
+                element_kernels.point_deformation,
                 (len(elastic.elements), self._weight.shape[1]),
                 [*self._model, elastic.elements, state.position, state.pressure],
-                self._parts,
+                self._deformations,
             )
             self._launch(
                 element_kernels.element_tangent_by_pair,
                 (len(elastic.elements), corners, corners),
                 [self._pairs, self._gradient, self._bulk, self._blocks_each, elastic.elements,
-                 *self._parts, self._volume_gradient],
+                 *self._deformations, self._volume_gradient],
                 [self._elastic],
             )  # fmt: skip
             self._launch(

@@ -122,22 +122,22 @@ def mean_gaps_to_indenter(
 
     ``hanging`` is the gap of each kind of indenter from which on a direction is held.
     """
-    f = items[wp.tid()]
+    item, q = wp.tid()
+    f = items[item]
     s = f % faces.shape[0]
     slot = f // faces.shape[0]
     begin = slot * nodes
     near = touchable(faces, gap_in, margin, s, begin)
-    for q in range(shape.shape[0]):
-        outward_out[f, q] = wp.vec3d()
-        held_out[f, q] = wp.vec3d()
-        if near:
-            x = at_point(faces, shape, position_in, s, q, begin)
-            local = wp.transpose(rotation[slot]) * (x - tip[slot])
-            found = indenter_distance(primitives[kind[slot]], local, wp.float64(1.0e300))
-            outward_out[f, q] = rotation[slot] * found.normal
-            if found.gap >= hanging[kind[slot]]:
-                held_out[f, q] = outward_out[f, q]
-            add_to_means(faces, weight, found.gap, s, q, begin, mean_out)
+    outward_out[f, q] = wp.vec3d()
+    held_out[f, q] = wp.vec3d()
+    if near:
+        x = at_point(faces, shape, position_in, s, q, begin)
+        local = wp.transpose(rotation[slot]) * (x - tip[slot])
+        found = indenter_distance(primitives[kind[slot]], local, wp.float64(1.0e300))
+        outward_out[f, q] = rotation[slot] * found.normal
+        if found.gap >= hanging[kind[slot]]:
+            held_out[f, q] = outward_out[f, q]
+        add_to_means(faces, weight, found.gap, s, q, begin, mean_out)
 
 
 @wp.kernel
@@ -157,17 +157,17 @@ def mean_gaps_to_core(
     mean_out: wp.array(dtype=wp.float64),
 ):
     """`mean_gaps_to_indenter` for the core."""
-    f = items[wp.tid()]
+    item, q = wp.tid()
+    f = items[item]
     s = f % faces.shape[0]
     begin = (f // faces.shape[0]) * nodes
     near = touchable(faces, gap_in, margin, s, begin)
-    for q in range(shape.shape[0]):
-        outward_out[f, q] = wp.vec3d()
-        if near:
-            x = at_point(faces, shape, position_in, s, q, begin)
-            found = core_distance(coefficients, origin, spacing, x)
-            outward_out[f, q] = found.normal
-            add_to_means(faces, weight, found.gap, s, q, begin, mean_out)
+    outward_out[f, q] = wp.vec3d()
+    if near:
+        x = at_point(faces, shape, position_in, s, q, begin)
+        found = core_distance(coefficients, origin, spacing, x)
+        outward_out[f, q] = found.normal
+        add_to_means(faces, weight, found.gap, s, q, begin, mean_out)
 
 
 @wp.kernel

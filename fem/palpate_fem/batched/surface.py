@@ -23,7 +23,8 @@ class BatchedSurface:
         def room(kind: type, *shape: int) -> wp.array:
             return wp.zeros(shape, dtype=kind, device=device)
 
-        self.count, points = surface.count, surface.points
+        # A face has as many quadrature points as corners, which are its contact points.
+        self.count, self.points = surface.count, surface.points
         faces = surface.faces.numpy()
         self.faces = on_device(faces, wp.int32, device)
         self.pairs = on_device(surface.pairs.numpy(), wp.int32, device)
@@ -35,8 +36,8 @@ class BatchedSurface:
         self.corner_area = on_device(mortar.corner_area, wp.float64, device)
         self.node_area = on_device(mortar.area, wp.float64, device)
         self.nodes = on_device(np.unique(faces).astype(np.int32), wp.int32, device)
-        total, inside = slots * self.count, len(mortar.shape)
-        size = (total, points)
+        points = self.points
+        size = (slots * self.count, points)
         self.status, self.frozen_status = room(wp.int32, *size), room(wp.int32, *size)
         self.gap, self.wanted = room(wp.float64, *size), room(wp.float64, *size)
         self.slope, self.frozen_slope = room(wp.vec3d, *size), room(wp.vec3d, *size)
@@ -47,12 +48,9 @@ class BatchedSurface:
         self.frozen_traction_slope = room(wp.mat33d, *size)
         self.unsymmetric, self.frozen_unsymmetric = room(wp.mat33d, *size), room(wp.mat33d, *size)
         self.target, self.target_traction = room(wp.float64, *size), room(wp.vec3d, *size)
-        self.mortar_status, self.mortar_tangent = (
-            room(wp.int32, total, inside),
-            room(wp.mat33d, total, inside),
-        )
+        self.mortar_status, self.mortar_tangent = room(wp.int32, *size), room(wp.mat33d, *size)
         self.offset = room(wp.float64, *size)
-        self.outward, self.held = room(wp.vec3d, total, inside), room(wp.vec3d, total, inside)
+        self.outward, self.held = room(wp.vec3d, *size), room(wp.vec3d, *size)
         self.node_gap, self.node_mean = (
             room(wp.float64, slots * nodes),
             room(wp.float64, slots * nodes),

@@ -346,7 +346,7 @@ class IndenterContact:
         primitives, kind, tip, rotation = indenter.model
         launch(
             contact_kernels.indenter_contact,
-            surface.count,
+            (surface.count, surface.points),
             [
                 *surface.model,
                 primitives,
@@ -373,7 +373,7 @@ class IndenterContact:
         if self.settings.mortar:
             launch(
                 contact_kernels.mortar_on_indenter,
-                surface.count,
+                (surface.count, surface.points),
                 [
                     *surface.quadrature,
                     primitives,
@@ -428,7 +428,7 @@ class CoreContact:
             return
         launch(
             contact_kernels.core_contact,
-            surface.count,
+            (surface.count, surface.points),
             [
                 *surface.model,
                 self._table,
@@ -448,7 +448,7 @@ class CoreContact:
         if self.settings.mortar:
             launch(
                 contact_kernels.mortar_on_core,
-                surface.count,
+                (surface.count, surface.points),
                 [
                     *surface.quadrature,
                     self._table,

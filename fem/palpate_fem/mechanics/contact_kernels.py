@@ -181,64 +181,64 @@ def indenter_contact(
     symmetrised: its transpose would make the matrix indefinite, by the square of half the friction
     coefficient.
     """
-    f = items[wp.tid()]
+    item, q = wp.tid()
+    f = items[item]
     s = f % faces.shape[0]
     copy = f // faces.shape[0]
     begin = copy * nodes
     tip = tip_in[copy]
     rotation = rotation_in[copy]
     shape_of = primitives[kind[copy]]
-    for q in range(shape.shape[0]):
-        x = at_point(faces, shape, position_in, s, q, begin)
-        local = wp.transpose(rotation) * (x - tip)
-        near = indenter_distance(shape_of, local, margin)
-        gap = near.gap + correction_in[f, q]
-        gap_out[f, q] = gap
-        status_out[f, q] = 0
-        wanted_out[f, q] = wp.float64(0.0)
-        slope_out[f, q] = wp.vec3d()
-        misfit_out[f, q] = wp.vec3d()
-        wanted_traction_out[f, q] = wp.vec3d()
-        traction_slope_out[f, q] = wp.mat33d()
-        coupled_out[f, q] = wp.vec3d()
-        unsymmetric_out[f, q] = wp.mat33d()
-        p = pressure_in[f, q]
-        # Points beyond the margin have no pressure: it was set to zero when they separated.
-        if near.gap < margin:
-            normal = rotation * near.normal
-            answer = normal_law(law, p, gap)
-            if answer[1] > wp.float64(0.0):
-                status_out[f, q] = 1
-                w = area[s, q]
-                curvature = rotation * near.hessian * wp.transpose(rotation)
-                slope = answer[1] * normal
-                wanted_out[f, q] = answer[0]
-                slope_out[f, q] = slope
-                residual = law.at_nodes * p * normal
-                misfit = (answer[0] - p) * normal
-                d = wp.outer(slope, normal) - law.at_nodes * p * curvature
-                unsymmetric = wp.mat33d()
-                if law.friction > wp.float64(0.0):
-                    t = traction_in[f, q]
-                    arm = x - (tip + rotation * anchor_in[f, q])
-                    rub = friction_law(law, p, t, normal, curvature, arm)
-                    status_out[f, q] = 1 + rub.status
-                    # Friction by the change of pressure. It is kept apart (``coupled``), as the
-                    # demanded pressure of a new point is far too large before the linear solve.
-                    grown = (answer[0] - p) * rub.by_pressure
-                    wanted_traction_out[f, q] = rub.wanted + grown
-                    coupled_out[f, q] = -w * grown
-                    coupled = wp.outer(rub.by_pressure, slope)
-                    traction_slope_out[f, q] = rub.by_position - coupled
-                    residual -= t
-                    misfit -= rub.wanted - t
-                    symmetric = wp.float64(0.5) * (rub.by_position + wp.transpose(rub.by_position))
-                    d += symmetric
-                    unsymmetric = rub.by_position - symmetric - coupled
-                misfit_out[f, q] = w * misfit
-                add_at_nodes(faces, shape, -w * residual, s, q, begin, force_out)
-                unsymmetric_out[f, q] = w * unsymmetric
-                tangent_out[f, q] = w * d
+    x = at_point(faces, shape, position_in, s, q, begin)
+    local = wp.transpose(rotation) * (x - tip)
+    near = indenter_distance(shape_of, local, margin)
+    gap = near.gap + correction_in[f, q]
+    gap_out[f, q] = gap
+    status_out[f, q] = 0
+    wanted_out[f, q] = wp.float64(0.0)
+    slope_out[f, q] = wp.vec3d()
+    misfit_out[f, q] = wp.vec3d()
+    wanted_traction_out[f, q] = wp.vec3d()
+    traction_slope_out[f, q] = wp.mat33d()
+    coupled_out[f, q] = wp.vec3d()
+    unsymmetric_out[f, q] = wp.mat33d()
+    p = pressure_in[f, q]
+    # Points beyond the margin have no pressure: it was set to zero when they separated.
+    if near.gap < margin:
+        normal = rotation * near.normal
+        answer = normal_law(law, p, gap)
+        if answer[1] > wp.float64(0.0):
+            status_out[f, q] = 1
+            w = area[s, q]
+            curvature = rotation * near.hessian * wp.transpose(rotation)
+            slope = answer[1] * normal
+            wanted_out[f, q] = answer[0]
+            slope_out[f, q] = slope
+            residual = law.at_nodes * p * normal
+            misfit = (answer[0] - p) * normal
+            d = wp.outer(slope, normal) - law.at_nodes * p * curvature
+            unsymmetric = wp.mat33d()
+            if law.friction > wp.float64(0.0):
+                t = traction_in[f, q]
+                arm = x - (tip + rotation * anchor_in[f, q])
+                rub = friction_law(law, p, t, normal, curvature, arm)
+                status_out[f, q] = 1 + rub.status
+                # Friction by the change of pressure. It is kept apart (``coupled``), as the
+                # demanded pressure of a new point is far too large before the linear solve.
+                grown = (answer[0] - p) * rub.by_pressure
+                wanted_traction_out[f, q] = rub.wanted + grown
+                coupled_out[f, q] = -w * grown
+                coupled = wp.outer(rub.by_pressure, slope)
+                traction_slope_out[f, q] = rub.by_position - coupled
+                residual -= t
+                misfit -= rub.wanted - t
+                symmetric = wp.float64(0.5) * (rub.by_position + wp.transpose(rub.by_position))
+                d += symmetric
+                unsymmetric = rub.by_position - symmetric - coupled
+            misfit_out[f, q] = w * misfit
+            add_at_nodes(faces, shape, -w * residual, s, q, begin, force_out)
+            unsymmetric_out[f, q] = w * unsymmetric
+            tangent_out[f, q] = w * d
 
 
 @wp.kernel
@@ -496,36 +496,36 @@ def core_contact(
     Adds minus the contact force to ``force_out``. Points in a cell whose coefficient exceeds
     ``margin`` are skipped.
     """
-    f = items[wp.tid()]
+    item, q = wp.tid()
+    f = items[item]
     s = f % faces.shape[0]
     begin = (f // faces.shape[0]) * nodes
-    for q in range(shape.shape[0]):
-        x = at_point(faces, shape, position_in, s, q, begin)
-        cell = grid_cell(coefficients, origin, spacing, x)
-        rough = coefficients[cell[0], cell[1], cell[2]]
-        gap_out[f, q] = rough
-        status_out[f, q] = 0
-        wanted_out[f, q] = wp.float64(0.0)
-        slope_out[f, q] = wp.vec3d()
-        misfit_out[f, q] = wp.vec3d()
-        p = pressure_in[f, q]
-        if rough < margin or p > wp.float64(0.0):
-            near = core_distance(coefficients, origin, spacing, x)
-            gap = near.gap + correction_in[f, q]
-            gap_out[f, q] = gap
-            answer = normal_law(law, p, gap)
-            if answer[1] > wp.float64(0.0):
-                status_out[f, q] = 1
-                wanted_out[f, q] = answer[0]
-                w = area[s, q]
-                slope_out[f, q] = answer[1] * near.normal
-                misfit_out[f, q] = (w * (answer[0] - p)) * near.normal
-                load = (law.at_nodes * w * p) * near.normal
-                add_at_nodes(faces, shape, -load, s, q, begin, force_out)
-                # -d(p n)/dx: stiffness along the normal, and the turn of the normal under p.
-                tangent_out[f, q] = w * (
-                    answer[1] * wp.outer(near.normal, near.normal) - law.at_nodes * p * near.hessian
-                )
+    x = at_point(faces, shape, position_in, s, q, begin)
+    cell = grid_cell(coefficients, origin, spacing, x)
+    rough = coefficients[cell[0], cell[1], cell[2]]
+    gap_out[f, q] = rough
+    status_out[f, q] = 0
+    wanted_out[f, q] = wp.float64(0.0)
+    slope_out[f, q] = wp.vec3d()
+    misfit_out[f, q] = wp.vec3d()
+    p = pressure_in[f, q]
+    if rough < margin or p > wp.float64(0.0):
+        near = core_distance(coefficients, origin, spacing, x)
+        gap = near.gap + correction_in[f, q]
+        gap_out[f, q] = gap
+        answer = normal_law(law, p, gap)
+        if answer[1] > wp.float64(0.0):
+            status_out[f, q] = 1
+            wanted_out[f, q] = answer[0]
+            w = area[s, q]
+            slope_out[f, q] = answer[1] * near.normal
+            misfit_out[f, q] = (w * (answer[0] - p)) * near.normal
+            load = (law.at_nodes * w * p) * near.normal
+            add_at_nodes(faces, shape, -load, s, q, begin, force_out)
+            # -d(p n)/dx: stiffness along the normal, and the turn of the normal under p.
+            tangent_out[f, q] = w * (
+                answer[1] * wp.outer(near.normal, near.normal) - law.at_nodes * p * near.hessian
+            )
 
 
 @wp.func
@@ -566,26 +566,26 @@ def mortar_on_indenter(
     Adds minus its forces to ``force_out``; the tangent is that at constant pressures. Where
     ``held_in`` is not zero, the pressure acts along it, and does not turn.
     """
-    f = items[wp.tid()]
+    item, q = wp.tid()
+    f = items[item]
     s = f % faces.shape[0]
     copy = f // faces.shape[0]
     begin = copy * nodes
     tip = tip_in[copy]
     rotation = rotation_in[copy]
     shape_of = primitives[kind[copy]]
-    for q in range(shape.shape[0]):
-        load = load_at_point(f, s, q, weight, pressure_in)
-        status_out[f, q] = 0
-        if load != wp.float64(0.0):
-            normal = held_in[f, q]
-            if normal == wp.vec3d():
-                x = at_point(faces, shape, position_in, s, q, begin)
-                local = wp.transpose(rotation) * (x - tip)
-                near = indenter_distance(shape_of, local, wp.float64(1.0e300))
-                normal = rotation * near.normal
-                status_out[f, q] = 1
-                tangent_out[f, q] = -load * (rotation * near.hessian * wp.transpose(rotation))
-            add_at_nodes(faces, shape, -load * normal, s, q, begin, force_out)
+    load = load_at_point(f, s, q, weight, pressure_in)
+    status_out[f, q] = 0
+    if load != wp.float64(0.0):
+        normal = held_in[f, q]
+        if normal == wp.vec3d():
+            x = at_point(faces, shape, position_in, s, q, begin)
+            local = wp.transpose(rotation) * (x - tip)
+            near = indenter_distance(shape_of, local, wp.float64(1.0e300))
+            normal = rotation * near.normal
+            status_out[f, q] = 1
+            tangent_out[f, q] = -load * (rotation * near.hessian * wp.transpose(rotation))
+        add_at_nodes(faces, shape, -load * normal, s, q, begin, force_out)
 
 
 @wp.kernel
@@ -605,15 +605,15 @@ def mortar_on_core(
     force_out: wp.array(dtype=wp.vec3d),
 ):
     """`mortar_on_indenter` for the core and the inner faces."""
-    f = items[wp.tid()]
+    item, q = wp.tid()
+    f = items[item]
     s = f % faces.shape[0]
     begin = (f // faces.shape[0]) * nodes
-    for q in range(shape.shape[0]):
-        load = load_at_point(f, s, q, weight, pressure_in)
-        status_out[f, q] = 0
-        if load != wp.float64(0.0):
-            x = at_point(faces, shape, position_in, s, q, begin)
-            near = core_distance(coefficients, origin, spacing, x)
-            status_out[f, q] = 1
-            tangent_out[f, q] = -load * near.hessian
-            add_at_nodes(faces, shape, -load * near.normal, s, q, begin, force_out)
+    load = load_at_point(f, s, q, weight, pressure_in)
+    status_out[f, q] = 0
+    if load != wp.float64(0.0):
+        x = at_point(faces, shape, position_in, s, q, begin)
+        near = core_distance(coefficients, origin, spacing, x)
+        status_out[f, q] = 1
+        tangent_out[f, q] = -load * near.hessian
+        add_at_nodes(faces, shape, -load * near.normal, s, q, begin, force_out)

@@ -43,6 +43,9 @@ BARRIER_FROM = 0.25
 
 FROM = wp.constant(wp.float64(BARRIER_FROM))
 
+Scales = wp.types.vector(length=5, dtype=wp.float64)
+"""Of the tangent at a quadrature point; see `tangent_scales`."""
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -203,6 +206,43 @@ def corner_forces(
         smallest_jacobian_out[e] = smallest
 
 
+@wp.func
+def tangent_scales(
+    f: wp.mat33d,
+    j: wp.float64,
+    w: wp.float64,
+    mu: wp.float64,
+    barrier: wp.float64,
+    stiffening: wp.float64,
+    pressure: wp.float64,
+) -> Scales:
+    """Scales of the tangent at a quadrature point, see `point_state`.
+
+    c, c I1 / 3 - w p J - w mu barrier b sign(ln J), s, 2/9 c I1, and 2/9 c I1 + w p J +
+    w mu barrier [b > 0], with c = w mu J^(-2/3) (1 + stiffening m^2) and
+    s = 9 w mu stiffening m (J^(-2/3) / c)^2.
+    """
+    power = wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
+    i1 = wp.ddot(f, f)
+    m = power * i1 - wp.float64(3.0)
+    c = w * mu * power * (wp.float64(1.0) + stiffening * m * m)
+    ci1 = c * i1
+    b = beyond(j)
+    wpj = w * (pressure * j + mu * barrier * b)
+    isochoric = ci1 * wp.float64(2.0) / wp.float64(9.0)
+    along = isochoric + w * pressure * j
+    if b != wp.float64(0.0):
+        along += w * mu * barrier
+    growth = wp.float64(9.0) * w * mu * stiffening * m * (power / c) * (power / c)
+    return Scales(c, ci1 / wp.float64(3.0) - wpj, growth, isochoric, along)
+
+
+@wp.func
+def left_of(scales: Scales, f: wp.mat33d, gradient: wp.vec3d) -> wp.vec3d:
+    """-2/3 c F grad N."""
+    return ((wp.float64(-2.0) / wp.float64(3.0)) * scales[0]) * (f * gradient)
+
+
 @wp.kernel
 def point_state(
     elements: wp.array2d(dtype=wp.int32),
@@ -218,78 +258,79 @@ def point_state(
     spatial_out: wp.array3d(dtype=wp.vec3d),
     left_out: wp.array3d(dtype=wp.vec3d),
     right_out: wp.array3d(dtype=wp.vec3d),
-    scale_out: wp.array2d(dtype=wp.vec4d),
+    scales_out: wp.array2d(dtype=Scales),
 ):
     """Vectors of which the tangent is made, for each element, quadrature point and node.
 
     With g = F^-T grad N and h = F grad N: spatial = g, left = -2/3 c h, right = left + (2/9 c I1 +
-    w p J + w mu barrier [b > 0]) g, scale = (c, c I1 / 3 - w p J - w mu barrier b sign(ln J), s,
-    2/9 c I1), c = w mu J^(-2/3) (1 + stiffening m^2). By the growth of c the tangent has s d x d
-    more, with d = left + 2/9 c I1 g and s = 9 w mu stiffening m (J^(-2/3) / c)^2. A thread for
-    each point.
+    w p J + w mu barrier [b > 0]) g; `tangent_scales`. By the growth of c the tangent has s d x d
+    more, with d = left + 2/9 c I1 g. A thread for each point.
     """
     item, q = wp.tid()
     e = items[item]
     s = e % elements.shape[0]
-    pressure = pressure_in[e]
     f = deformation(elements, gradient, position_in, s, q, (e // elements.shape[0]) * nodes)
     j = wp.determinant(f)
-    w = weight[s, q]
     inverse_t = wp.transpose(wp.inverse(f))
-    power = wp.pow(wp.abs(j), (wp.float64(-2.0) / wp.float64(3.0)))
-    i1 = wp.ddot(f, f)
-    m = power * i1 - wp.float64(3.0)
-    c = w * mu * power * (wp.float64(1.0) + stiffening * m * m)
-    ci1 = c * i1
-    b = beyond(j)
-    wpj = w * (pressure * j + mu * barrier * b)
-    isochoric = ci1 * wp.float64(2.0) / wp.float64(9.0)
-    along = isochoric + w * pressure * j
-    if b != wp.float64(0.0):
-        along += w * mu * barrier
+    scales = tangent_scales(f, j, weight[s, q], mu, barrier, stiffening, pressure_in[e])
     for a in range(elements.shape[1]):
         g = inverse_t * gradient[s, q, a]
-        left = ((wp.float64(-2.0) / wp.float64(3.0)) * c) * (f * gradient[s, q, a])
+        left = left_of(scales, f, gradient[s, q, a])
         spatial_out[e, q, a] = g
         left_out[e, q, a] = left
-        right_out[e, q, a] = left + along * g
-    growth = wp.float64(9.0) * w * mu * stiffening * m * (power / c) * (power / c)
-    scale_out[e, q] = wp.vec4d(c, ci1 / wp.float64(3.0) - wpj, growth, isochoric)
+        right_out[e, q, a] = left + scales[4] * g
+    scales_out[e, q] = scales
+
+
+@wp.kernel
+def point_deformation(
+    elements: wp.array2d(dtype=wp.int32),
+    gradient: wp.array3d(dtype=wp.vec3d),
+    weight: wp.array2d(dtype=wp.float64),
+    mu: wp.float64,
+    barrier: wp.float64,
+    stiffening: wp.float64,
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
+    position_in: wp.array(dtype=wp.vec3d),
+    pressure_in: wp.array(dtype=wp.float64),
+    deformation_out: wp.array2d(dtype=wp.mat33d),
+    inverse_out: wp.array2d(dtype=wp.mat33d),
+    scales_out: wp.array2d(dtype=Scales),
+):
+    """What `point_state` makes its vectors of: F, F^-T and scales.
+
+    On a GPU each pair of nodes makes the vectors that it needs: to write them and to read them
+    again takes longer.
+    """
+    item, q = wp.tid()
+    e = items[item]
+    s = e % elements.shape[0]
+    f = deformation(elements, gradient, position_in, s, q, (e // elements.shape[0]) * nodes)
+    deformation_out[e, q] = f
+    inverse_out[e, q] = wp.transpose(wp.inverse(f))
+    scales_out[e, q] = tangent_scales(
+        f, wp.determinant(f), weight[s, q], mu, barrier, stiffening, pressure_in[e]
+    )
 
 
 @wp.func
-def tangent_block(
-    e: int,
-    element: int,
-    a: int,
-    b: int,
-    gradient: wp.array3d(dtype=wp.vec3d),
-    stiff: wp.float64,
-    spatial_in: wp.array3d(dtype=wp.vec3d),
-    left_in: wp.array3d(dtype=wp.vec3d),
-    right_in: wp.array3d(dtype=wp.vec3d),
-    scale_in: wp.array2d(dtype=wp.vec4d),
-    volume_gradient_in: wp.array2d(dtype=wp.vec3d),
+def tangent_at_point(
+    scales: Scales,
+    ga: wp.vec3d,
+    gb: wp.vec3d,
+    left_a: wp.vec3d,
+    left_b: wp.vec3d,
+    right_b: wp.vec3d,
 ) -> wp.mat33d:
-    """Condensed tangent of nodes a and b of an element.
+    """Share of a quadrature point in the tangent of nodes a and b, but for the multiple of I.
 
-    K_ab = sum_q c (dNa . dNb) I + ga x right_b + left_a x gb + scale gb x ga + s da x db, plus
-    kappa/v0 dv dv.
+    ga x right_b + left_a x gb + scale gb x ga + s da x db
     """
-    # Condensation of p = kappa (v - v0) / v0: one rank-1 term for the whole element.
-    k = wp.outer(stiff * volume_gradient_in[e, a], volume_gradient_in[e, b])
-    diagonal = wp.float64(0.0)
-    for q in range(spatial_in.shape[1]):
-        ga = spatial_in[e, q, a]
-        gb = spatial_in[e, q, b]
-        s = scale_in[e, q]
-        diagonal += s[0] * wp.dot(gradient[element, q, a], gradient[element, q, b])
-        k += wp.outer(ga, right_in[e, q, b])
-        k += wp.outer(left_in[e, q, a], gb)
-        k += wp.outer(s[1] * gb, ga)
-        if s[2] != wp.float64(0.0):
-            k += wp.outer(s[2] * (left_in[e, q, a] + s[3] * ga), left_in[e, q, b] + s[3] * gb)
-    return k + diagonal * wp.identity(n=3, dtype=wp.float64)
+    k = wp.outer(ga, right_b) + wp.outer(left_a, gb) + wp.outer(scales[1] * gb, ga)
+    if scales[2] != wp.float64(0.0):
+        k += wp.outer(scales[2] * (left_a + scales[3] * ga), left_b + scales[3] * gb)
+    return k
 
 
 @wp.kernel
@@ -302,22 +343,34 @@ def element_tangent(
     spatial_in: wp.array3d(dtype=wp.vec3d),
     left_in: wp.array3d(dtype=wp.vec3d),
     right_in: wp.array3d(dtype=wp.vec3d),
-    scale_in: wp.array2d(dtype=wp.vec4d),
+    scales_in: wp.array2d(dtype=Scales),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
     block_out: wp.array(dtype=wp.mat33d),
 ):
-    """Add the condensed tangent to the upper node-pair blocks; a ``pair`` below 0 has none."""
+    """Add the condensed tangent to the upper node-pair blocks; a ``pair`` below 0 has none.
+
+    K_ab = sum_q c (dNa . dNb) I + `tangent_at_point`, plus kappa/v0 dv dv.
+    """
     e = items[wp.tid()]
-    element = e % pair.shape[0]
+    s = e % pair.shape[0]
     begin = (e // pair.shape[0]) * blocks
     for a in range(pair.shape[1]):
         for b in range(pair.shape[1]):
-            block = pair[element, a, b]
+            block = pair[s, a, b]
             if block >= 0:
-                k = tangent_block(
-                    e, element, a, b, gradient, bulk_over_volume[element], spatial_in, left_in,
-                    right_in, scale_in, volume_gradient_in,
-                )  # fmt: skip
+                # Condensation of p = kappa (v - v0) / v0: one rank-1 term for the whole element.
+                k = wp.outer(
+                    bulk_over_volume[s] * volume_gradient_in[e, a], volume_gradient_in[e, b]
+                )
+                diagonal = wp.float64(0.0)
+                for q in range(spatial_in.shape[1]):
+                    scales = scales_in[e, q]
+                    diagonal += scales[0] * wp.dot(gradient[s, q, a], gradient[s, q, b])
+                    k += tangent_at_point(
+                        scales, spatial_in[e, q, a], spatial_in[e, q, b], left_in[e, q, a],
+                        left_in[e, q, b], right_in[e, q, b],
+                    )  # fmt: skip
+                k += diagonal * wp.identity(n=3, dtype=wp.float64)
                 wp.atomic_add(block_out, begin + block, k)
 
 
@@ -328,23 +381,32 @@ def element_tangent_by_pair(
     bulk_over_volume: wp.array(dtype=wp.float64),
     blocks: int,
     items: wp.array(dtype=wp.int32),
-    spatial_in: wp.array3d(dtype=wp.vec3d),
-    left_in: wp.array3d(dtype=wp.vec3d),
-    right_in: wp.array3d(dtype=wp.vec3d),
-    scale_in: wp.array2d(dtype=wp.vec4d),
+    deformation_in: wp.array2d(dtype=wp.mat33d),
+    inverse_in: wp.array2d(dtype=wp.mat33d),
+    scales_in: wp.array2d(dtype=Scales),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
     block_out: wp.array(dtype=wp.mat33d),
 ):
     """`element_tangent` with a thread for each pair of nodes, for a GPU, which has so many."""
     item, a, b = wp.tid()
     e = items[item]
-    element = e % pair.shape[0]
-    block = pair[element, a, b]
+    s = e % pair.shape[0]
+    block = pair[s, a, b]
     if block >= 0:
-        k = tangent_block(
-            e, element, a, b, gradient, bulk_over_volume[element], spatial_in, left_in, right_in,
-            scale_in, volume_gradient_in,
-        )  # fmt: skip
+        k = wp.outer(bulk_over_volume[s] * volume_gradient_in[e, a], volume_gradient_in[e, b])
+        diagonal = wp.float64(0.0)
+        for q in range(scales_in.shape[1]):
+            scales = scales_in[e, q]
+            of_a = gradient[s, q, a]
+            of_b = gradient[s, q, b]
+            diagonal += scales[0] * wp.dot(of_a, of_b)
+            gb = inverse_in[e, q] * of_b
+            left_b = left_of(scales, deformation_in[e, q], of_b)
+            k += tangent_at_point(
+                scales, inverse_in[e, q] * of_a, gb, left_of(scales, deformation_in[e, q], of_a),
+                left_b, left_b + scales[4] * gb,
+            )  # fmt: skip
+        k += diagonal * wp.identity(n=3, dtype=wp.float64)
         wp.atomic_add(block_out, (e // pair.shape[0]) * blocks + block, k)
 
 

@@ -71,7 +71,9 @@ class SkinElements:
         self._frozen_gradient = vec3s(np.zeros((self.count, nodes, 3)))
         # Results of `point_state`, of which the tangent is made.
         self._parts = [vec3s(np.zeros((self.count, points, nodes, 3))) for _ in range(3)]
-        self._parts.append(wp.zeros((self.count, points), dtype=wp.vec4d, device=DEVICE))
+        self._parts.append(
+            wp.zeros((self.count, points), dtype=element_kernels.Scales, device=DEVICE)
+        )
 
     def add_forces(
         self, items: wp.array, position: wp.array, pressure: wp.array, force: wp.array
