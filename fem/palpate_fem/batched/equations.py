@@ -87,6 +87,7 @@ class BatchedEquations:
         held[pattern.free] = 0
         self._held = ints(held)
         total, corners = slots * self._elements_each, mesh.elements.shape[1]
+        self._couples = on_device(np.transpose(np.triu_indices(corners)), wp.vec2i, device)
         points = skin.weight_values.shape[1]
 
         def room(kind: type, *shape: int) -> wp.array:
@@ -403,9 +404,9 @@ class BatchedEquations:
             )
             self._launch(
                 element_kernels.element_tangent_by_pair,
-                (len(elastic.elements), corners, corners),
-                [self._pairs, self._gradient, self._bulk, self._blocks_each, elastic.elements,
-                 *self._deformations, self._volume_gradient],
+                (len(elastic.elements), len(self._couples)),
+                [self._pairs, self._couples, self._gradient, self._bulk, self._blocks_each,
+                 elastic.elements, *self._deformations, self._volume_gradient],
                 [self._elastic],
             )  # fmt: skip
             self._launch(

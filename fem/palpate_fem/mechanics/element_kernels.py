@@ -377,6 +377,7 @@ def element_tangent(
 @wp.kernel
 def element_tangent_by_pair(
     pair: wp.array3d(dtype=wp.int32),
+    couples: wp.array(dtype=wp.vec2i),
     gradient: wp.array3d(dtype=wp.vec3d),
     bulk_over_volume: wp.array(dtype=wp.float64),
     blocks: int,
@@ -387,27 +388,33 @@ def element_tangent_by_pair(
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
     block_out: wp.array(dtype=wp.mat33d),
 ):
-    """`element_tangent` with a thread for each pair of nodes, for a GPU, which has so many."""
-    item, a, b = wp.tid()
+    """`element_tangent` with a thread for each pair of corners, for a GPU, which has so many.
+
+    ``couples`` has each pair of corners in one order, which need not be that of their nodes.
+    """
+    item, couple = wp.tid()
     e = items[item]
     s = e % pair.shape[0]
-    block = pair[s, a, b]
-    if block >= 0:
-        k = wp.outer(bulk_over_volume[s] * volume_gradient_in[e, a], volume_gradient_in[e, b])
-        diagonal = wp.float64(0.0)
-        for q in range(scales_in.shape[1]):
-            scales = scales_in[e, q]
-            of_a = gradient[s, q, a]
-            of_b = gradient[s, q, b]
-            diagonal += scales[0] * wp.dot(of_a, of_b)
-            gb = inverse_in[e, q] * of_b
-            left_b = left_of(scales, deformation_in[e, q], of_b)
-            k += tangent_at_point(
-                scales, inverse_in[e, q] * of_a, gb, left_of(scales, deformation_in[e, q], of_a),
-                left_b, left_b + scales[4] * gb,
-            )  # fmt: skip
-        k += diagonal * wp.identity(n=3, dtype=wp.float64)
-        wp.atomic_add(block_out, (e // pair.shape[0]) * blocks + block, k)
+    a = couples[couple][0]
+    b = couples[couple][1]
+    if pair[s, a, b] < 0:
+        a = couples[couple][1]
+        b = couples[couple][0]
+    k = wp.outer(bulk_over_volume[s] * volume_gradient_in[e, a], volume_gradient_in[e, b])
+    diagonal = wp.float64(0.0)
+    for q in range(scales_in.shape[1]):
+        scales = scales_in[e, q]
+        of_a = gradient[s, q, a]
+        of_b = gradient[s, q, b]
+        diagonal += scales[0] * wp.dot(of_a, of_b)
+        gb = inverse_in[e, q] * of_b
+        left_b = left_of(scales, deformation_in[e, q], of_b)
+        k += tangent_at_point(
+            scales, inverse_in[e, q] * of_a, gb, left_of(scales, deformation_in[e, q], of_a),
+            left_b, left_b + scales[4] * gb,
+        )  # fmt: skip
+    k += diagonal * wp.identity(n=3, dtype=wp.float64)
+    wp.atomic_add(block_out, (e // pair.shape[0]) * blocks + pair[s, a, b], k)
 
 
 @wp.kernel
