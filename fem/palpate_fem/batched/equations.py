@@ -87,7 +87,9 @@ class BatchedEquations:
         held[pattern.free] = 0
         self._held = ints(held)
         total, corners = slots * self._elements_each, mesh.elements.shape[1]
-        self._couples = on_device(np.transpose(np.triu_indices(corners)), wp.vec2i, device)
+        self._couples = on_device(
+            np.transpose(np.triu_indices(corners)).astype(np.int32), wp.vec2i, device
+        )
         points = skin.weight_values.shape[1]
 
         def room(kind: type, *shape: int) -> wp.array:
@@ -107,8 +109,8 @@ class BatchedEquations:
             room(wp.vec3d, slots * self._nodes) for _ in range(3)
         )
         self._field, self._product = (room(wp.vec3d, slots * self._nodes) for _ in range(2))
-        self.outer = BatchedSurface(system.outer, self._nodes, slots, device)
-        self.inner = BatchedSurface(system.inner, self._nodes, slots, device)
+        self.outer = BatchedSurface(system.outer, self._nodes, slots, device, rubs=True)
+        self.inner = BatchedSurface(system.inner, self._nodes, slots, device, rubs=False)
         self._form = numbers(volume_form(system.inner.points))
         self._face_volume = room(wp.float64, slots * self.inner.count)
         self._kinds(indenters)

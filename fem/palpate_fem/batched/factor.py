@@ -270,9 +270,10 @@ class BatchedFactor:
         self._launch(
             kernels.begin_marks, (count, len(tiles.fronts)), [slots, self.bad], [self.marked]
         )
+        entries = self.values.shape[1]
         self._launch(
             kernels.mark_changed,
-            (count, self.values.shape[1]),
+            (count, -(-entries // kernels.ENTRIES)),
             [slots, self._entry_front, self._parent, self.values],
             [self._known, self.marked, self.bad],
         )
@@ -335,11 +336,11 @@ class BatchedFactor:
         known: list[Any],
         out: list[Any],
     ) -> None:
-        """Launch a kernel for every row of the fronts of a level, two vectors."""
+        """Launch a kernel for every row of the fronts of a level."""
         first, last = self._front_begins[level : level + 2]
         self._launch(
             kernel,
-            (len(slots), last - first, self._largest[level][1] * TILE, LANES),
+            (len(slots), last - first, self._largest[level][1] * TILE),
             [slots, self._by_level, self._fronts, *plan, first, self.tiles.rows, *known],
             out,
         )

@@ -21,6 +21,9 @@ from palpate_fem.batched.dense_tiles import THREADS, WIDE
 
 wp.set_module_options({"enable_backward": False})
 
+ENTRIES = 4
+"""Entries of a matrix that a thread compares."""
+
 
 @wp.func
 def lower_tile(row: int, column: int):
@@ -54,17 +57,20 @@ def mark_changed(
     Whoever finds a front marked may stop there: who marked it goes on upwards. All listed matrices
     are called good until they are factorised.
     """
-    i, k = wp.tid()
+    i, thread = wp.tid()
     slot = slots[i]
-    if k == 0:
+    if thread == 0:
         bad_out[slot] = 0
-    value = values_in[slot, k]
-    if value != known[slot, k]:
-        known[slot, k] = value
-        front = front_of[k]
-        while front >= 0 and marked[slot, front] == 0:
-            marked[slot, front] = 1
-            front = parent[front]
+    entries = values_in.shape[1]
+    threads = (entries + wp.static(ENTRIES) - 1) // wp.static(ENTRIES)
+    for k in range(thread, entries, threads):
+        value = values_in[slot, k]
+        if value != known[slot, k]:
+            known[slot, k] = value
+            front = front_of[k]
+            while front >= 0 and marked[slot, front] == 0:
+                marked[slot, front] = 1
+                front = parent[front]
 
 
 @wp.kernel(launch_bounds=(WIDE, 1))

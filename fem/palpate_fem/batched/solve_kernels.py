@@ -13,7 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from palpate_fem.batched import dense_vectors
-from palpate_fem.batched.dense_tiles import TILE, end_of
+from palpate_fem.batched.dense_tiles import LANES, TILE, end_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,24 +39,25 @@ def gather_loads(
     -1 = padding. ``loaded`` tells of fronts whose own rows are not all zero: the load of a
     correction, at the contact alone, loads few.
     """
-    i, number, at, lane = wp.tid()
+    i, number, at = wp.tid()
     slot = slots[i]
     front = listed[first + number]
     own = at < wp.static(TILE) * fronts[front, 0]
     if at < wp.static(TILE) * fronts[front, 1]:
         base = slot * rows
         row = fronts[front, 6] + at
-        total = wp.float64(0.0)
-        if lane < lanes:
-            if own and row_links[row] >= 0:
-                total = vectors_in[slot, lane, row_links[row]]
-            for child in range(fronts[front, 2], fronts[front, 3]):
-                there = rows_in_child[children[child, 0] + at]
-                if there >= 0:
-                    total += begun[base + children[child, 2] + there, lane]
-        begun[base + row, lane] = total
-        if own and total != wp.float64(0.0):
-            loaded[slot, front] = 1
+        for lane in range(wp.static(LANES)):
+            total = wp.float64(0.0)
+            if lane < lanes:
+                if own and row_links[row] >= 0:
+                    total = vectors_in[slot, lane, row_links[row]]
+                for child in range(fronts[front, 2], fronts[front, 3]):
+                    there = rows_in_child[children[child, 0] + at]
+                    if there >= 0:
+                        total += begun[base + children[child, 2] + there, lane]
+            begun[base + row, lane] = total
+            if own and total != wp.float64(0.0):
+                loaded[slot, front] = 1
 
 
 @wp.kernel
@@ -104,15 +105,16 @@ def gather_answers(
     begun: wp.array2d(dtype=wp.float64),
 ):
     """Bring what is solved above to the borders of fronts."""
-    i, number, at, lane = wp.tid()
+    i, number, at = wp.tid()
     front = listed[first + number]
     if at >= wp.static(TILE) * fronts[front, 0] and at < wp.static(TILE) * fronts[front, 1]:
         base = slots[i] * rows
         row = fronts[front, 6] + at
-        value = wp.float64(0.0)
-        if row_links[row] >= 0:
-            value = begun[base + row_links[row], lane]
-        begun[base + row, lane] = value
+        for lane in range(wp.static(LANES)):
+            value = wp.float64(0.0)
+            if row_links[row] >= 0:
+                value = begun[base + row_links[row], lane]
+            begun[base + row, lane] = value
 
 
 @wp.kernel

@@ -17,7 +17,10 @@ from palpate_fem.mechanics.contact import ContactSurface
 class BatchedSurface:
     """One surface of all copies: constants of one, results and frozen values of each."""
 
-    def __init__(self, surface: ContactSurface, nodes: int, slots: int, device: str) -> None:
+    def __init__(
+        self, surface: ContactSurface, nodes: int, slots: int, device: str, *, rubs: bool
+    ) -> None:
+        """Make room; without friction, unless it ``rubs``, what belongs to it stays zero."""
         self._each, self._launches = nodes, Launches(device)
 
         def room(kind: type, *shape: int) -> wp.array:
@@ -64,9 +67,12 @@ class BatchedSurface:
         self.frozen = [
             (self.status, self.frozen_status, points),
             (self.slope, self.frozen_slope, 3 * points),
-            (self.traction_slope, self.frozen_traction_slope, 9 * points),
-            (self.unsymmetric, self.frozen_unsymmetric, 9 * points),
         ]
+        if rubs:
+            self.frozen += [
+                (self.traction_slope, self.frozen_traction_slope, 9 * points),
+                (self.unsymmetric, self.frozen_unsymmetric, 9 * points),
+            ]
 
     def offset_gaps(self, items: wp.array, margin: wp.float64) -> None:
         """Set what the mean gaps of listed faces add to those of their nodes."""
