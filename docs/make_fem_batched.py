@@ -57,8 +57,7 @@ def outcomes(run: dict[str, Any]) -> str:
 
 def processes(run: dict[str, Any]) -> str:
     """How many processes shared the device, and what is to be said of the run."""
-    remarks = [name for key, name in (("mps", "MPS"), ("before", "before")) if run.get(key)]
-    return ", ".join([str(run.get("together", 1)), *remarks])
+    return f"{run.get('together', 1)}{', MPS' * run.get('mps', False)}"
 
 
 def times(runs: list[dict[str, Any]]) -> str:
@@ -199,7 +198,7 @@ def main() -> None:
     report, meshes = read("slots.json"), read("meshes.json")
     factor, sweeps = read("factor.json"), read("sweeps.json")
     runs = report["runs"] + meshes["runs"]
-    draw([run for run in runs if not run.get("before")], FOLDER / "time.png")
+    draw([run for run in runs if "together" not in run], FOLDER / "time.png")
     sections = [
         HEAD,
         f"## Time\n\n{report['device']}: `{report['command']}` and `{meshes['command']}`. "
@@ -227,7 +226,8 @@ def main() -> None:
     sections += [
         f"\n## Served\n\n{asked['device']}, `palpate fem serve --device cuda:0 --slots"
         f" {asked['slots']}` behind a router, each caller with one request after the other:"
-        f" `{asked['command']}`. *Bare*: the same presses in one process, nothing between.\n",
+        f" `{asked['command']}`. *Bare*: the same presses in one process, nothing between;"
+        " measured before the changes that are named under *Sweeps*.\n",
         served(asked),
         f"\nThe solver's process killed (SIGKILL) while 32 callers had requests there:"
         f" `{asked['killed']['command']}`. All were answered; workers began, and the next process"

@@ -89,7 +89,7 @@ def _fem() -> Iterator[Claim]:
     yield Claim(
         "README.md",
         "{ms192} ms a press (goals 100 and 30; two processes that share it take "
-        "{ms192xmb}), {ms16} ms with 16 at once, {ms1} ms alone",
+        "{ms192xm}), {ms16} ms with 16 at once, {ms1} ms alone",
         figures,
     )
     yield Claim(
@@ -99,19 +99,17 @@ def _fem() -> Iterator[Claim]:
     )
     yield Claim(
         "docs/adr/0026-many-at-once.md",
-        "two take {ms192xb} ms, two under NVIDIA's MPS **{ms192xmb} ms**, three {ms192xxmb}, "
-        "four {ms192xxxmb} (one {ms192b})",
+        "two take {ms192x} ms, two under NVIDIA's MPS **{ms192xm} ms**, three {ms192xxm}, "
+        "four {ms192xxxm}",
         figures,
     )
-    yield Claim(
-        "docs/twin.md", "{ms192xb} ms a press instead of {ms192b}, and {ms192xmb}\n", figures
-    )
+    yield Claim("docs/twin.md", "{ms192x} ms a press instead of {ms192}, and {ms192xm}\n", figures)
 
 
 def _name_of(run: dict[str, Any]) -> str:
-    """Of a run's figure: its slots, an x for each further process, m = MPS, b = before."""
+    """Of a run's figure: its slots, an x for each further process, m = MPS."""
     further = "x" * (run.get("together", 1) - 1)
-    return f"ms{run['slots']}{further}{'m' * run.get('mps', False)}{'b' * run.get('before', False)}"
+    return f"ms{run['slots']}{further}{'m' * run.get('mps', False)}"
 
 
 def _rows(name: str) -> dict[tuple[str, str], dict[str, float]]:
