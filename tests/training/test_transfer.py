@@ -212,7 +212,27 @@ def test_a_held_out_press_is_estimated_as_if_it_had_not_been_labelled(
     np.testing.assert_allclose(whole.held_out[~others], without.force[rows[~others]], atol=1e-8)
 
 
-def test_presses_tell_that_a_finger_is_more_sensitive(model: ForceTransfer) -> None:
+def test_the_size_of_its_signals_tells_that_a_finger_is_more_sensitive() -> None:
+    """It is alike at rest, and without that its forces would seem several times as large."""
+
+    def slow(seed: int, sensitivity: float) -> Finger:
+        """In use for some minutes."""
+        one = fingers_of(invented(seed, sensitivity=sensitivity))[0]
+        return replace(one, recording=replace(one.recording, period_s=0.1))
+
+    sensitive, other, of_its_kind = slow(2, 4.0), slow(1, 1.0), slow(4, 4.0)
+    for unlabelled in (False, True):
+        result = run_transfer([other], sensitive, unlabelled=unlabelled)
+        assert not result["unlike"]
+        assert 3.0 < result["signal_ratio"] < 5.0
+        assert result["magnitude_median_n"] < 0.8 * result["constant"]["magnitude_median_n"]
+        assert result["magnitude_median_n"] < 0.3 * result["ridge"]["magnitude_median_n"]
+    assert run_transfer([other, of_its_kind], sensitive)["signal_ratio"] < transfer.SAME_USE
+
+
+def test_presses_tell_how_sensitive_a_finger_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the size of its signals does not."""
+    monkeypatch.setattr(transfer, "SAME_USE", 100.0)
     sensitive = fingers_of(invented(2, sensitivity=4.0))[0]
     results = {
         shots: run_transfer([finger(1)], sensitive, shots=shots, draws=3) for shots in (0, 5)
@@ -220,6 +240,28 @@ def test_presses_tell_that_a_finger_is_more_sensitive(model: ForceTransfer) -> N
     constant = results[5]["constant"]["magnitude_median_n"]
     assert results[0]["magnitude_median_n"] > 2.0 * constant
     assert results[5]["magnitude_median_n"] < 0.5 * constant
+
+
+def test_a_finger_that_is_pressed_somewhat_harder_is_estimated_as_it_is(
+    model: ForceTransfer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long it is left untouched, too."""
+    one = finger(2).recording
+    hard = one.eased(np.full(ROWS, 1.0 / 1.3))
+    idle = replace(
+        hard,
+        electrodes=np.vstack([np.tile(hard.baseline[:1], (ROWS, 1)), hard.electrodes]),
+        baseline=np.vstack([hard.baseline] * 2),
+        segment=np.zeros(2 * ROWS, np.int64),
+        force=np.vstack([0.0 * hard.force, hard.force]),
+    )
+    ratios = [model.signal_ratio(each, whole=True)[-1] for each in (one, hard, idle)]
+    assert 0.8 < ratios[0] < 1.0 + 0.5 * (transfer.SAME_USE - 1.0)
+    assert ratios[1] < transfer.SAME_USE
+    assert ratios[2] == pytest.approx(ratios[1], rel=0.02)
+    estimate = model.estimate(hard, unlabelled=False)
+    monkeypatch.setattr(transfer, "SAME_USE", 100.0)
+    np.testing.assert_array_equal(model.estimate(hard, unlabelled=False), estimate)
 
 
 def test_presses_of_a_finger_like_the_others_do_not_change_its_scale(

@@ -274,6 +274,7 @@ def train_transfer(
         worst_of,
     )
     from palpate_training.learning.twin_line import read_line
+    from palpate_training.systems.transfer import SAME_USE
 
     line = read_line() if twin else None
     known = [finger for path in train for finger in fingers_of(open_dataset(path))]
@@ -315,6 +316,12 @@ def train_transfer(
                 f"{result['test']} is unlike the others: untouched, its impedance is"
                 f" {result['impedance_ratio']:.2g} times that of the nearest one. Only labelled"
                 " presses tell how sensitive it is: --shots 1 or more"
+            )
+        elif result["signal_ratio"] > SAME_USE:
+            console.print(
+                f"The signals of {result['test']} are {result['signal_ratio']:.2g} times as large"
+                " as those of the others. It is taken for more sensitive, not for pressed harder;"
+                " labelled presses tell: --shots 1 or more"
             )
 
 

@@ -152,6 +152,8 @@ def run_transfer(
         ``impedance_ratio``, the finger's untouched impedance over that of the nearest one trained
         on, and ``unlike``, whether it is so far from 1 that nothing tells how sensitive this finger
         is (`ALIKE`). Then, without a press, every estimate is the others' mean force.
+        ``signal_ratio``, the size of its signals over that of the finger trained on with the
+        largest; from `SAME_USE` on they are scaled down.
 
     Raises:
         DatasetError: The tested finger is among the others, or has too few presses.
@@ -220,6 +222,7 @@ def run_transfer(
         "twin": line is not None,
         "rows": len(test.recording.force),
         "impedance_ratio": ratio,
+        "signal_ratio": float(model.signal_ratio(test.recording, whole=True)[-1]),
         "unlike": unlike,
     }
 

@@ -15,13 +15,18 @@ finger is far more or less sensitive than the others, its estimates are scaled f
 presses on, a line through the rows of all fingers, corrected in the same way, has a share. The
 share is the one that estimates each of these presses best without itself.
 
+Without a press nothing but the size of its signals tells how sensitive a finger is. Where they are
+far larger than those of all other fingers, it is taken for more sensitive rather than for one that
+is pressed harder than ever, and its signals are scaled down to theirs: what is learned goes no
+further.
+
 The magnitude's processes start from a line through the presses of a simulated population, mapped to
 real fingers by what was learned on the others (``TwinLine``); what they learn is what that line
 leaves. A network of the population helped in no way that was tried (training/LOG.md).
 
 All constants were chosen on the two fingers of the LASA force calibration, in both directions, the
-worse counting, and then frozen; those for fingers that are unlike the others, and for the line, on
-simulated ones, too (training/LOG.md).
+worse counting, and then frozen; those for fingers that are unlike the others or more sensitive, and
+for the line, on simulated ones, too (training/LOG.md).
 """
 
 from __future__ import annotations
@@ -34,12 +39,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 from scipy.signal import lfilter
+from scipy.special import xlogy
 
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
 from palpate_training.learning.baselines import AffineModel, ridge
 from palpate_training.learning.electrode_nets import MIRROR_AXES
 from palpate_training.learning.twin_line import TwinLine
-from palpate_training.systems.samples import impedance_ohm
+from palpate_training.systems.samples import counts_at, impedance_ohm
 
 Floats = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.number]
@@ -146,6 +152,18 @@ ALIKE = 2.0
 alike. Skin nearer to the core makes a finger more sensitive, and its impedance larger."""
 
 
+SAME_USE = 1.5
+"""Size of a finger's signals over that of the others, up to which it may well be as sensitive as
+they and only be pressed harder. From its square on it is taken for more sensitive."""
+
+SIZE_S = 10.0
+"""Before anything is seen of a finger, its signals have the size of the others', as if it had been
+seen for so long [s]."""
+
+LEAST_SIGNAL = 1e-6
+"""A logarithm that no electrode can tell from 0."""
+
+
 @dataclass(frozen=True, slots=True)
 class FingerRecording:
     """Rows of one finger in order of time.
@@ -170,6 +188,17 @@ class FingerRecording:
         values -= (1.0 - inputs.common) * values.mean(axis=1, keepdims=True)
         means = (self._moving_mean(values, context_s) for context_s in inputs.contexts_s)
         return [values, *(values - mean for mean in means)]
+
+    def signals(self) -> Floats:
+        """Sizes of the present values without their common mode, shape (N,)."""
+        sizes = np.linalg.norm(self.parts(Inputs(()))[0], axis=1)
+        return np.asarray(np.maximum(sizes, LEAST_SIGNAL))
+
+    def eased(self, ratio: Floats) -> FingerRecording:
+        """The same with logarithms of the impedance over that at rest divided by ratios (N,)."""
+        rest = impedance_ohm(self.baseline)
+        log = np.log(impedance_ohm(self.electrodes) / rest)
+        return replace(self, electrodes=counts_at(rest * np.exp(log / ratio[:, None])))
 
     def rest_log(self) -> float:
         """Logarithm of the untouched impedance [ohm], mean over electrodes and rows."""
@@ -322,6 +351,7 @@ class ForceTransfer:
         """
         self._sources = sources
         self._scale = _Scale.shared(sources, CORRECTION_INPUTS)
+        self._signals = [source.signals() for source in sources]
         prior = None if line is None else _mapped(line, sources)
         self._magnitude = [_Process(sources, *each, prior=prior) for each in MAGNITUDE]
         self._direction = [_Process(sources, *each) for each in DIRECTION]
@@ -339,12 +369,40 @@ class ForceTransfer:
             unlabelled: Whether mean and spread of all its electrodes may be used, later rows
                 included; else a row's estimate follows from the tare and the rows before it.
         """
+        ratio = self.signal_ratio(recording, whole=unlabelled)
+        # 0 up to `SAME_USE`, 1 from its square on.
+        share = np.clip(np.log(ratio) / np.log(SAME_USE) - 1.0, 0.0, 1.0)
+        if share.any():
+            recording = recording.eased(ratio**share)
         direction = _mean_direction([process(recording) for process in self._direction])
         if unlabelled:
             direction += _mean_direction([process(recording) for process in self._aligned])
             direction = _unit(direction)
         lengths = [np.linalg.norm(process(recording), axis=1) for process in self._magnitude]
         return np.asarray(np.mean(lengths, axis=0)[:, None] * direction)
+
+    def signal_ratio(self, recording: FingerRecording, *, whole: bool) -> Floats:
+        """Size of a finger's signals over that of the training finger with the largest, (N,).
+
+        The size is a geometric mean over the rows, each weighted by itself, so that it does not
+        matter how long a finger is left untouched.
+
+        Args:
+            recording: Of the new finger.
+            whole: Whether all rows tell it; else those up to each.
+        """
+        signals = recording.signals()
+        weight, told = signals, xlogy(signals, signals)
+        weight, told = (
+            np.full(len(one), one.sum()) if whole else np.cumsum(one) for one in (weight, told)
+        )
+        rows = SIZE_S / recording.period_s
+        ratios = []
+        for known in self._signals:
+            known_weight, known_told = known.mean(), xlogy(known, known).mean()
+            size = (told + rows * known_told) / (weight + rows * known_weight)
+            ratios.append(np.exp(size - known_told / known_weight))
+        return np.asarray(np.min(ratios, axis=0))
 
     def impedance_ratio(self, recording: FingerRecording) -> float:
         """Untouched impedance over that of the training finger that is nearest in it."""
