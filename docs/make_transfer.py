@@ -35,7 +35,7 @@ from palpate_training.figures.style import markdown_table, new_figure, save
 from palpate_training.learning.force_process import ForceLine
 from palpate_training.learning.twin_line import read_line
 from palpate_training.systems.samples import counts_at, impedance_ohm
-from palpate_training.systems.transfer import ForceTransfer
+from palpate_training.systems.transfer import SAME_USE, ForceTransfer
 from palpate_training.tasks.finger import ROWS_MOST, estimate_of, fit_finger
 
 Floats = NDArray[np.float64]
@@ -219,7 +219,7 @@ def on_simulated_fingers() -> str:
     groups: dict[str, list[dict[str, Any]]] = {}
     for one in report["results"]:
         kind = "unlike" if one["unlike"] else "alike"
-        groups.setdefault(kind + ", looked at" * one["looked_at"], []).append(one)
+        groups.setdefault(", ".join(filter(None, (kind, one["kind"]))), []).append(one)
     rows = []
     for name, group in sorted(groups.items()):
         for shots in sorted({one["shots"] for one in group}):
@@ -251,16 +251,18 @@ simulated ones ([commands](../make_transfer_simulated.py)), each with a skin, fi
 its own, pressed {report["presses"]} times and drifting as real ones do: each tested after each
 other one alone was learned from. *Unlike*: untouched, the impedance of one is more than twice that
 of the other. Then, without a press, the estimate is the other's mean force, as nothing tells how
-sensitive the finger is. With presses, leaving each out in its turn tells whether the scale of the
-estimates is wrong, too, and how much to believe a line (a ridge regression on logarithms of
-impedances that knows the same presses, corrected by them in the same way). When a scale is wrong
-was found on the pairs that were *looked at*; that it is one number, and the line, on all of these
-fingers and the real ones (training/LOG.md).
+sensitive the finger is. Of the others the size of their signals tells it: beyond {SAME_USE:g} times
+those of the other finger they are scaled down, from {SAME_USE**2:g} times on to the same size. That
+could be wrong, as a finger may be pressed harder than the other was: of those *pressed harder* only
+the harder half of the presses is in the recording. With presses, leaving each out in its turn
+tells whether the scale of the estimates is wrong, too, and how much to believe a line: a ridge
+regression on logarithms of impedances that knows the same presses, corrected by them in the same
+way. All that was found on these fingers, and on the real ones (training/LOG.md), where signals
+differ by 1.4 and nothing is scaled; with the {report["new_fingers"]} *new* fingers nothing was
+chosen.
 
-Without a press a simulated finger can mislead by newtons, alike at rest or not. With one press or
-more hardly any pair is worse than the constant, and directions are as good as the ridge
-regression's or better. On three more fingers, with which nothing was chosen, the line helped as
-much: with ten presses a median over 54 pairs of 0.22 N for 0.29 (training/LOG.md).
+With one press or more hardly any pair is worse than the constant, and from five on few are worse
+than the ridge regression.
 
 {markdown_table(head, rows)}"""
 

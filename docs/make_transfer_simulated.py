@@ -4,20 +4,27 @@ r"""Measure the method for fingers that were never met on simulated ones: transf
     palpate data generate runs/others --random 560 --fingertips 8 --units drawn8.json \
         --edge-mm 1.2 --seed 77
     palpate data features runs/others/fingertip-0?/mixed.h5 others.h5
-    python docs/make_transfer_simulated.py others.h5
+    ... the same with seed 78, units of their own and runs/new ...
+    palpate data features runs/new/fingertip-0[123]/mixed.h5 new.h5
+    python docs/make_transfer_simulated.py others.h5 new.h5
     python docs/make_transfer.py
 
 The constants of the method were chosen on two real fingers. Simulated ones have other skins, fills,
 core's places and electrodes. Each is pressed ``PRESSES`` times, at random points by random
 indenters; a recording is made of these presses, with the drift of real sensors. Each finger is
 tested after each other one alone was learned from. What is done where a finger is more sensitive
-than others was found on the first `LOOKED_AT` of them.
+than others, and with the line beside, was found on those of the first file; with those of the
+second nothing was chosen. Without a press those of the first are tested once more, pressed by the
+harder half of their presses alone: then larger signals do not mean a more sensitive finger.
 """
 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import sys
+from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +32,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 from scipy.signal import lfilter
+from threadpoolctl import threadpool_limits
 
 from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.features import FeatureDataset, open_dataset
@@ -52,9 +60,13 @@ NOISE_COUNTS = 2.0
 SHOTS = (0, 1, 5, 10)
 DRAWS = 4
 
-LOOKED_AT = 4
+RIVALS = ("ridge", "constant")
+TOLD = (*FIGURES, "coverage_90", "shots", "unlike", "impedance_ratio", "signal_ratio", *RIVALS)
 
-TOLD = (*FIGURES, "coverage_90", "shots", "unlike", "impedance_ratio", "ridge", "constant")
+NEW, HARDER = "new", "pressed harder"
+"""Kinds of pairs: one of the two is from the second file; the tested one is pressed harder."""
+
+PROCESSES = 2
 
 
 def drift(random: np.random.Generator, rows: int, deviation: float, seconds: float) -> Floats:
@@ -91,11 +103,25 @@ def pressed(
     return whole[:, :19], whole[:, 19:]
 
 
-def recording_of(data: FeatureDataset, sensor: int, random: np.random.Generator) -> Finger:
-    """A recording of a simulated finger as a lab would make it."""
+def recording_of(
+    data: FeatureDataset, sensor: int, random: np.random.Generator, *, harder: bool
+) -> Finger:
+    """A recording of a simulated finger as a lab would make it.
+
+    Args:
+        data: Presses of all fingers.
+        sensor: Which finger.
+        random: Which of its presses, how deep, and drift.
+        harder: Whether only the half of its presses is used that has the largest forces.
+    """
     own = np.flatnonzero(data.sensor == sensor)
     rest = data.baseline[own].mean(axis=0, dtype=np.float64)
-    presses = random.permutation(np.unique(data.group[own]))[:PRESSES]
+    presses = np.unique(data.group[own])
+    if harder:
+        force = np.linalg.norm(data.force[own], axis=1)
+        most = np.array([force[data.group[own] == press].max() for press in presses])
+        presses = presses[most > np.median(most)]
+    presses = random.permutation(presses)[:PRESSES]
     parts = [
         pressed(data, own[data.group[own] == press], random.uniform(0.3, 1.0)) for press in presses
     ]
@@ -120,27 +146,55 @@ def recording_of(data: FeatureDataset, sensor: int, random: np.random.Generator)
     return finger
 
 
-def main(path: Path) -> None:
+def fingers_in(path: Path, seed: int, *, harder: bool = False) -> list[Finger]:
+    """A recording of each finger of a file."""
+    data, random = open_dataset(path), np.random.default_rng(seed)
+    sensors = range(len(data.sensor_names))
+    return [recording_of(data, sensor, random, harder=harder) for sensor in sensors]
+
+
+def measure(pair: tuple[Finger, Finger, str]) -> list[dict[str, Any]]:
+    """A finger that is learned from, one that is tested, and what is told of the two."""
+    known, tested, kind = pair
+    results = []
+    with threadpool_limits(1):
+        for shots in SHOTS[:1] if kind == HARDER else SHOTS:
+            found = run_transfer([known], tested, shots=shots, draws=DRAWS, line=read_line())
+            told = {"train": known.name, "test": tested.name, "kind": kind}
+            results.append(told | {key: found[key] for key in TOLD})
+    return results
+
+
+def main(path: Path, path_of_new: Path) -> None:
     """Measure all pairs, and write the result."""
-    data, line = open_dataset(path), read_line()
-    random = np.random.default_rng(0)
-    fingers = [recording_of(data, sensor, random) for sensor in range(len(data.sensor_names))]
+    first, harder = fingers_in(path, 0), fingers_in(path, 2, harder=True)
+    new = [replace(one, name=f"new-{one.name}") for one in fingers_in(path_of_new, 1)]
+    pairs = [(*pair, "") for pair in permutations(first, 2)]
+    pairs += [
+        (*pair, NEW)
+        for pair in permutations([*first, *new], 2)
+        if any(one is other for one in pair for other in new)
+    ]
+    pairs += [
+        (known, harder[k], HARDER)
+        for known in first
+        for k, tested in enumerate(first)
+        if tested is not known
+    ]
     results: list[dict[str, Any]] = []
-    for known in fingers:
-        for tested in fingers:
-            if tested is known:
-                continue
-            looked_at = max(fingers.index(known), fingers.index(tested)) < LOOKED_AT
-            for shots in SHOTS:
-                found = run_transfer([known], tested, shots=shots, draws=DRAWS, line=line)
-                told = {"train": known.name, "test": tested.name, "looked_at": looked_at}
-                results.append(told | {key: found[key] for key in TOLD})
-                CONSOLE.print(*told.values(), shots, *(round(one[FIGURES[0]], 3) for one in
-                              (found, found["ridge"], found["constant"])))  # fmt: skip
+    with multiprocessing.get_context("spawn").Pool(PROCESSES) as pool:
+        for found in pool.imap(measure, pairs):
+            results += found
+            for one in found:
+                figures = (one[FIGURES[0]], *(one[rival][FIGURES[0]] for rival in RIVALS))
+                CONSOLE.print(len(results), one["train"], one["test"], one["kind"], one["shots"],
+                              *(round(figure, 3) for figure in figures))  # fmt: skip
     report = {
-        "schema": "palpate.transfer-simulated 1",
-        "content_sha256": data.content_sha256(),
-        "fingers": len(fingers),
+        "schema": "palpate.transfer-simulated 2",
+        "content_sha256": open_dataset(path).content_sha256(),
+        "content_sha256_of_new": open_dataset(path_of_new).content_sha256(),
+        "fingers": len(first),
+        "new_fingers": len(new),
         "presses": PRESSES,
         "draws": DRAWS,
         "results": results,
@@ -149,4 +203,4 @@ def main(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(*map(Path, sys.argv[1:]))

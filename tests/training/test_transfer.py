@@ -247,7 +247,7 @@ def test_a_finger_that_is_pressed_somewhat_harder_is_estimated_as_it_is(
 ) -> None:
     """However long it is left untouched, too."""
     one = finger(2).recording
-    hard = one.eased(np.full(ROWS, 1.0 / 1.3))
+    hard = one.with_signals_divided(np.full(ROWS, 1.0 / 1.3))
     idle = replace(
         hard,
         electrodes=np.vstack([np.tile(hard.baseline[:1], (ROWS, 1)), hard.electrodes]),

@@ -151,7 +151,6 @@ ALIKE = 2.0
 """Mean impedance at rest of a finger over that of another one, up to which they are taken for
 alike. Skin nearer to the core makes a finger more sensitive, and its impedance larger."""
 
-
 SAME_USE = 1.5
 """Size of a finger's signals over that of the others, up to which it may well be as sensitive as
 they and only be pressed harder. From its square on it is taken for more sensitive."""
@@ -194,7 +193,7 @@ class FingerRecording:
         sizes = np.linalg.norm(self.parts(Inputs(()))[0], axis=1)
         return np.asarray(np.maximum(sizes, LEAST_SIGNAL))
 
-    def eased(self, ratio: Floats) -> FingerRecording:
+    def with_signals_divided(self, ratio: Floats) -> FingerRecording:
         """The same with logarithms of the impedance over that at rest divided by ratios (N,)."""
         rest = impedance_ohm(self.baseline)
         log = np.log(impedance_ohm(self.electrodes) / rest)
@@ -373,7 +372,7 @@ class ForceTransfer:
         # 0 up to `SAME_USE`, 1 from its square on.
         share = np.clip(np.log(ratio) / np.log(SAME_USE) - 1.0, 0.0, 1.0)
         if share.any():
-            recording = recording.eased(ratio**share)
+            recording = recording.with_signals_divided(ratio**share)
         direction = _mean_direction([process(recording) for process in self._direction])
         if unlabelled:
             direction += _mean_direction([process(recording) for process in self._aligned])
