@@ -315,6 +315,11 @@ def test_what_cannot_be_tested_is_refused() -> None:
         run_transfer([one, two], replace(two, name="another name"))
     with pytest.raises(DatasetError, match="8 presses of 2 s, 8 are to be labelled"):
         run_transfer([one], two, shots=8)
+    # Pieces of a second have no press of two; without labels none is needed.
+    short = replace(two, recording=replace(two.recording, segment=np.arange(ROWS) // 100))
+    with pytest.raises(DatasetError, match=r"has 0 presses of 2 s, 1 are.*label at most 0,"):
+        run_transfer([one], short, shots=1)
+    assert run_transfer([one], short)["rows"] == ROWS
 
 
 def test_draws_are_reproducible_and_leave_the_labelled_rows_out() -> None:

@@ -165,10 +165,10 @@ def run_transfer(
                 remedy="test a finger that the training has not met",
             )
     pieces = _presses(test.recording)
-    if shots >= len(pieces):
+    if shots > (most := max(0, len(pieces) - 1)):
         raise DatasetError(
             f"{test.name!r} has {len(pieces)} presses of {PRESS_S:g} s, {shots} are to be labelled",
-            remedy=f"label at most {len(pieces) - 1}, so that some are left to test",
+            remedy=f"label at most {most}, so that some are left to test",
         )
     sources = [finger.recording for finger in train]
     width = _width_on_others(train, line, on_step)
