@@ -56,7 +56,7 @@ def outcomes(run: dict[str, Any]) -> str:
 
 
 def processes(run: dict[str, Any]) -> str:
-    """How many processes shared the device, and what is to be said of the run."""
+    """How many processes shared the device, and whether under MPS."""
     return f"{run.get('together', 1)}{', MPS' * run.get('mps', False)}"
 
 

@@ -25,6 +25,7 @@ there are as many conditions as unknowns. Quadrature points inside the faces (2 
 times as many; their conditions contradict one another by the sagitta of the facet, and the sets
 cycle (ADR 0013).
 
+What evaluates contact has a thread for each point of the listed faces, all else one for each face.
 A NumPy twin of each function is in ``tests/fem/numpy_mechanics.py``.
 """
 

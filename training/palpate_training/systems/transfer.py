@@ -181,9 +181,13 @@ class FingerRecording:
     period_s: float
     force: Floats
 
+    def logarithms(self) -> Floats:
+        """Of the impedance over that at rest, the common mode included, shape (N, 19)."""
+        return np.asarray(np.log(impedance_ohm(self.electrodes) / impedance_ohm(self.baseline)))
+
     def parts(self, inputs: Inputs) -> list[Floats]:
         """Present values, then their differences from moving means, each of shape (N, 19)."""
-        values = np.log(impedance_ohm(self.electrodes) / impedance_ohm(self.baseline))
+        values = self.logarithms()
         values -= (1.0 - inputs.common) * values.mean(axis=1, keepdims=True)
         means = (self._moving_mean(values, context_s) for context_s in inputs.contexts_s)
         return [values, *(values - mean for mean in means)]
@@ -194,10 +198,9 @@ class FingerRecording:
         return np.asarray(np.maximum(sizes, LEAST_SIGNAL))
 
     def with_signals_divided(self, ratio: Floats) -> FingerRecording:
-        """The same with logarithms of the impedance over that at rest divided by ratios (N,)."""
-        rest = impedance_ohm(self.baseline)
-        log = np.log(impedance_ohm(self.electrodes) / rest)
-        return replace(self, electrodes=counts_at(rest * np.exp(log / ratio[:, None])))
+        """The same with its logarithms divided by ratios (N,)."""
+        over_rest = np.exp(self.logarithms() / ratio[:, None])
+        return replace(self, electrodes=counts_at(impedance_ohm(self.baseline) * over_rest))
 
     def rest_log(self) -> float:
         """Logarithm of the untouched impedance [ohm], mean over electrodes and rows."""
@@ -443,7 +446,7 @@ class ForceTransfer:
 
     def _by_line(self, recording: FingerRecording, process: _ErrorProcess) -> CorrectedForces:
         """The same by a ridge regression that knows the labelled rows, corrected by them."""
-        inputs = _logarithms(recording)
+        inputs = recording.logarithms()
 
         def estimate(known: _ErrorProcess) -> Floats:
             rows = known.labelled.rows
@@ -455,7 +458,7 @@ class ForceTransfer:
     @cached_property
     def _line_rows(self) -> list[tuple[Floats, Floats]]:
         """Inputs of the line and forces, of each training finger."""
-        return [(_logarithms(source), source.force) for source in self._sources]
+        return [(source.logarithms(), source.force) for source in self._sources]
 
 
 def _scaled(process: _ErrorProcess, estimate: Floats) -> CorrectedForces:
@@ -477,11 +480,6 @@ def _scaled(process: _ErrorProcess, estimate: Floats) -> CorrectedForces:
             return CorrectedForces(process.force(estimate), held_out)
         held_out = without
     return CorrectedForces(process.force(scaled), held_out)
-
-
-def _logarithms(recording: FingerRecording) -> Floats:
-    """Of the impedance over that at rest, the common mode included, shape (N, 19)."""
-    return recording.parts(Inputs((), common=1.0))[0]
 
 
 def line_through(
