@@ -22,8 +22,8 @@ from palpate_fem.mesh.solid import SolidMesh
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-SAME = 1e-10
-"""Relative, of two eliminations of matrices with a condition of 1e3."""
+SAME = 1e-5
+"""Relative, of solutions with matrices whose condition is 1e3: tiles are in single precision."""
 
 BODIES = [
     (1, 0),  # fewer unknowns than a tile, and a forest
@@ -321,13 +321,21 @@ def test_solves_for_a_tangent(shell: Callable[..., SolidMesh]) -> None:
     factor.values.assign(np.stack((values, 3.0 * values)))
     factor.factorise(listed((0, 1)))
     assert not factor.bad.numpy().any()
-    right = np.random.default_rng(6).normal(size=(2, 2, len(pattern.free)))
-    vectors = wp.array(right, dtype=wp.float64, device=DEVICE)
-    factor.solve(listed((0, 1)), vectors, 2)
     size = len(pattern.free)
     upper = sp.csr_matrix((values, pattern.indices, pattern.indptr), shape=(size, size))
-    solver = splu((upper + sp.triu(upper, 1).T).tocsc())
-    for slot, scale in enumerate((1.0, 3.0)):
-        wanted = solver.solve(right[slot].T).T / scale
-        error = np.abs(vectors.numpy()[slot] - wanted).max()
-        assert error < 1e-8 * np.abs(wanted).max()
+    matrix = (upper + sp.triu(upper, 1).T).tocsc()
+    right = np.random.default_rng(6).normal(size=(2, 2, size))
+    wanted = splu(matrix).solve(right.reshape(-1, size).T).T.reshape(right.shape)
+    wanted[1] /= 3.0
+    found, errors = np.zeros_like(right), []
+    for _ in range(3):  # what is left over is solved for again
+        left = [
+            right[slot] - scale * (matrix @ found[slot].T).T for slot, scale in ((0, 1.0), (1, 3.0))
+        ]
+        vectors = wp.array(np.stack(left), dtype=wp.float64, device=DEVICE)
+        factor.solve(listed((0, 1)), vectors, 2)
+        found = found + vectors.numpy()
+        errors.append(np.abs(found - wanted).max() / np.abs(wanted).max())
+    assert errors[0] < 1e-2  # nearly incompressible: the bulk modulus is 1e4 times the other
+    assert errors[1] < 1e-2 * errors[0]
+    assert errors[2] < 1e-2 * errors[1]

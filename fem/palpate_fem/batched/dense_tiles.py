@@ -35,6 +35,7 @@ THREADS, WIDE = 256, 512
 """Threads of a block, which share a front: where there are many fronts, and where there are few."""
 
 TENSOR_CORES = """
+    using stored = float;  // what tiles are stored in
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
 #define PALPATE_TENSOR_CORES
     // Rows g (upper) and g + 8 (lower) of C += A B.
@@ -55,7 +56,14 @@ TENSOR_CORES = """
         part(lower, b.y, k.y);
 #endif
     };
-    auto pair_at = [](const double* p) { return *reinterpret_cast<const double2*>(p); };
+    struct Four { double2 first, second; };
+    auto four_at = [](const auto* p) {
+        using number = decltype(+*p);
+        struct alignas(4 * sizeof(number)) Numbers { number x, y, z, w; };
+        const Numbers four = *reinterpret_cast<const Numbers*>(p);
+        return Four{make_double2(stored(four.x), stored(four.y)),
+                    make_double2(stored(four.z), stored(four.w))};
+    };
 #endif
 """
 
@@ -64,32 +72,37 @@ _PRODUCTS = (
     + """
     const int lane = thread % 32;
 #ifdef PALPATE_TENSOR_CORES
-    const int row = lane / 4, column = 2 * (lane % 4);
+    const int row = lane / 4, column = 2 * (lane % 4), four = 4 * (lane % 4);
     // A warp works on half a tile, 16 rows of it: the sums of a whole one take too many registers.
-    auto add_tiles = [=](double (&sum)[2][4][2], const double* a, const double* b) {
-        a += row * 32 + column;
-        b += row * 32 + column;
-        #pragma unroll 2
-        for (int k = 0; k < 32; k += 8, a += 8, b += 8) {
-            const double2 upper = pair_at(a), lower = pair_at(a + 256);
+    auto add_tiles = [=](double (&sum)[2][4][2], const auto* a, const stored* b) {
+        a += row * 32 + four;
+        b += row * 32 + four;
+        #pragma unroll 1
+        for (int k = 0; k < 32; k += 16, a += 16, b += 16) {
+            const Four upper = four_at(a), lower = four_at(a + 256);
             #pragma unroll
-            for (int n = 0; n < 4; ++n)
-                add_product(sum[0][n], sum[1][n], upper, lower, pair_at(b + 256 * n));
+            for (int n = 0; n < 4; ++n) {
+                const Four other = four_at(b + 256 * n);
+                add_product(sum[0][n], sum[1][n], upper.first, lower.first, other.first);
+                add_product(sum[0][n], sum[1][n], upper.second, lower.second, other.second);
+            }
         }
     };
     auto int_pair_at = [](const int* p) { return *reinterpret_cast<const int2*>(p); };
     // Half of: target = sign times sum
-    auto write = [=](double* target, const double (&sum)[2][4][2], int half, double sign) {
+    auto write = [=](auto* target, const double (&sum)[2][4][2], int half, double sign) {
+        using number = decltype(+*target);
+        struct alignas(2 * sizeof(number)) Pair { number x, y; };
         #pragma unroll
         for (int m = 0; m < 2; ++m)
             #pragma unroll
             for (int n = 0; n < 4; ++n)
-                *reinterpret_cast<double2*>(
+                *reinterpret_cast<Pair*>(
                     target + 512 * half + (8 * m + row) * 32 + 8 * n + column)
-                    = make_double2(sign * sum[m][n][0], sign * sum[m][n][1]);
+                    = Pair{number(sign * sum[m][n][0]), number(sign * sum[m][n][1])};
     };
     // Half of: target = - sum - sum over i of a_i times transposed b_i
-    auto subtract = [=](double (&sum)[2][4][2], double* target, const double* a, const double* b,
+    auto subtract = [=](double (&sum)[2][4][2], auto* target, const stored* a, const stored* b,
                         int count, int half) {
         __syncwarp();  // threads that gathered meet again
         for (int i = 0; i < count; ++i)
@@ -98,13 +111,13 @@ _PRODUCTS = (
     };
 #else
     // Target = begin - sum over n of a_n times transposed b_n
-    auto subtract = [](double* target, const double* a, const double* b, int count, auto begin) {
+    auto subtract = [](auto* target, const stored* a, const stored* b, int count, auto begin) {
         for (int i = 0; i < 32; ++i)
             for (int j = 0; j < 32; ++j) {
                 double sum = begin(i, j);
                 for (int n = 0; n < count; ++n)
                     for (int k = 0; k < 32; ++k)
-                        sum -= a[1024 * n + 32 * i + k] * b[1024 * n + 32 * j + k];
+                        sum -= double(a[1024 * n + 32 * i + k]) * b[1024 * n + 32 * j + k];
                 target[32 * i + j] = sum;
             }
     };
@@ -120,7 +133,7 @@ _CHILDREN = """
     };
     // An entry of a share, a lower triangle. Where there is none, the first one is read in vain:
     // with a branch a thread would wait for each entry before it asks for the next.
-    auto entry_of = [](const double* share, int a, int b) {
+    auto entry_of = [](const stored* share, int a, int b) {
         const bool inside = a >= (b & 0x7fffffff);  // -1 becomes the largest number
         const int row = (((a >> 5) * ((a >> 5) + 1)) >> 1) * 1024 + (a & 31) * 32;
         const int column = (b >> 5) * 1024 + (b & 31);
@@ -134,15 +147,23 @@ _CHILDREN = """
             const int* rows_there = rows_in(k);
             const int* a = rows_there + 32 * r + 16 * half + row;
             const int* b = rows_there + 32 * c + column;
-            const double* share = share_of(k);
+            const stored* share = share_of(k);
             const int upper = a[0], lower = a[8];
+            int2 at[4];
+            bool none = true;
             #pragma unroll
             for (int n = 0; n < 4; ++n) {
-                const int2 at = int_pair_at(b + 8 * n);
-                sum[0][n][0] -= entry_of(share, upper, at.x);
-                sum[0][n][1] -= entry_of(share, upper, at.y);
-                sum[1][n][0] -= entry_of(share, lower, at.x);
-                sum[1][n][1] -= entry_of(share, lower, at.y);
+                at[n] = int_pair_at(b + 8 * n);
+                none = none && (at[n].x & at[n].y) < 0;  // both are -1
+            }
+            if (__all_sync(~0u, none || (upper & lower) < 0))
+                continue;
+            #pragma unroll
+            for (int n = 0; n < 4; ++n) {
+                sum[0][n][0] -= entry_of(share, upper, at[n].x);
+                sum[0][n][1] -= entry_of(share, upper, at[n].y);
+                sum[1][n][0] -= entry_of(share, lower, at[n].x);
+                sum[1][n][1] -= entry_of(share, lower, at[n].y);
             }
         }
     };
@@ -161,9 +182,9 @@ _SUBTRACT_PRODUCT = (
     _PRODUCTS
     + _CHILDREN
     + """
-    double* target = shares.data + size_t(tile) * 1024;
-    const double* a = panels.data + size_t(left) * 1024;
-    const double* b = panels.data + size_t(right) * 1024;
+    stored* target = shares.data + size_t(tile) * 1024;
+    const stored* a = panels.data + size_t(left) * 1024;
+    const stored* b = panels.data + size_t(right) * 1024;
 #ifdef PALPATE_TENSOR_CORES
     double sum[2][4][2] = {};
     gather(sum, r, c, thread / 32);
@@ -176,7 +197,7 @@ _SUBTRACT_PRODUCT = (
 )
 
 FRONT = """
-    double* tiles = panels.data + size_t(panel) * 1024;
+    stored* tiles = panels.data + size_t(panel) * 1024;
     // First tile of a row of tiles; below the triangle all rows are equally long.
     auto above = [=](int r) {
         return r < own ? r * (r + 1) / 2 : own * (own + 1) / 2 + (r - own) * own;
@@ -215,14 +236,14 @@ _PANEL = (
             }
     };
     // Half of: target = what tile (r, c) begins with, less the products of its row with row c
-    auto begin = [=](double* target, int r, int c, int half, int count) {
+    auto begin = [=](auto* target, int r, int c, int half, int count) {
         double sum[2][4][2] = {};
         gather(sum, r, c, half);
         add_entries(sum, r, c, half);
         subtract(sum, target, tiles_of(r), tiles_of(c), count, half);
     };
 #else
-    auto begin = [=](double* target, int r, int c, int count) {
+    auto begin = [=](auto* target, int r, int c, int count) {
         const int* from = sources_of(r, c);
         subtract(target, tiles_of(r), tiles_of(c), count, [=](int i, int j) {
             return gathered(r, c, i, j) + (from ? value_of(from[32 * i + j]) : 0.0);
@@ -234,27 +255,27 @@ _PANEL = (
 
 _DIVIDE = """
 #ifdef PALPATE_TENSOR_CORES
-    // Half of: target = target times transposed b
-    auto multiply = [=](double* target, const double* b, int half) {
+    // Half of: target = source, rounded, times transposed b
+    auto multiply = [=](stored* target, const auto* source, const stored* b, int half) {
         double sum[2][4][2] = {};
-        add_tiles(sum, target + 512 * half, b);
-        __syncwarp();  // all have read what is overwritten now
+        add_tiles(sum, source + 512 * half, b);
+        __syncwarp();  // all have read what may be overwritten now
         write(target, sum, half, 1.0);
     };
-    __shared__ double exchange[2][2][32];
+    __shared__ stored exchange[2][2][32];
     constexpr int warps = WP_TILE_BLOCK_DIM / 32, each = 32 / warps;
     const int warp = thread / 32;
     // The inverse factor of a diagonal tile, by a block of threads; false: a pivot is not positive.
     // Every thread has some numbers of a row. Up to column k they are the inverse factor's,
     // which needs no room before; beyond, what elimination has left of the matrix.
-    auto invert = [=](double (&mine)[each], const double* diagonal) {
+    auto invert = [=](stored (&mine)[each], const auto* diagonal) {
         #pragma unroll
         for (int t = 0; t < each; ++t)
-            mine[t] = diagonal[32 * lane + warp + warps * t];
+            mine[t] = stored(diagonal[32 * lane + warp + warps * t]);
         bool good = true;
         for (int k = 0; k < 32; ++k) {
-            double* of_column = exchange[k % 2][0];
-            double* of_row = exchange[k % 2][1];
+            stored* of_column = exchange[k % 2][0];
+            stored* of_row = exchange[k % 2][1];
             #pragma unroll
             for (int t = 0; t < each; ++t) {
                 if (warp + warps * t == k)
@@ -263,18 +284,14 @@ _DIVIDE = """
                     of_row[warp + warps * t] = mine[t];
             }
             __syncthreads();
-            const double pivot = of_column[k];
-            good = good && pivot > 0.0 && pivot < 1e300;
-            double scale;  // 1 / sqrt(pivot): 20 bits, doubled twice
-            asm("rsqrt.approx.ftz.f64 %0, %1;" : "=d"(scale) : "d"(pivot));
-            scale *= 1.5 - 0.5 * pivot * scale * scale;
-            scale *= 1.5 - 0.5 * pivot * scale * scale;
-            const double factor = of_column[lane] * scale;
+            const stored pivot = of_column[k];
+            good = good && pivot > 0.f && pivot < 1e30f;
+            const stored scale = rsqrtf(pivot), factor = of_column[lane] * scale;
             #pragma unroll
             for (int t = 0; t < each; ++t) {
                 const int j = warp + warps * t;
-                const double other = (j > k ? of_column[j] : j < k ? of_row[j] : 1.0) * scale;
-                const double before = j == k ? 0.0 : mine[t];
+                const stored other = (j > k ? of_column[j] : j < k ? of_row[j] : 1.f) * scale;
+                const stored before = j == k ? 0.f : mine[t];
                 if (lane > k)
                     mine[t] = before - factor * other;
                 else if (j <= k)
@@ -283,24 +300,24 @@ _DIVIDE = """
         }
         return good;
     };
-    auto put = [=](double* to, const double (&mine)[each], bool good) {
+    auto put = [=](stored* to, const stored (&mine)[each], bool good) {
         #pragma unroll
         for (int t = 0; t < each; ++t) {
             const int j = warp + warps * t;
-            to[32 * lane + j] = good ? mine[t] : (j == lane ? 1.0 : 0.0);
+            to[32 * lane + j] = good ? mine[t] : (j == lane ? 1.f : 0.f);
         }
     };
 #else
-    auto invert = [](double* to, const double* diagonal) {
+    auto invert = [](stored* to, const auto* diagonal) {
         double factor[1024] = {}, inverse[1024] = {};
         bool good = true;
         for (int j = 0; j < 32; ++j)
             for (int i = j; i < 32; ++i) {
-                double sum = diagonal[32 * i + j];
+                double sum = stored(diagonal[32 * i + j]);
                 for (int k = 0; k < j; ++k)
                     sum -= factor[32 * i + k] * factor[32 * j + k];
                 if (i == j)
-                    good = good && sum > 0.0 && sum < 1e300;
+                    good = good && sum > 0.0 && sum < 1e30;
                 factor[32 * i + j] = i == j ? sqrt(sum) : sum / factor[32 * j + j];
             }
         for (int j = 0; j < 32; ++j)
@@ -311,17 +328,17 @@ _DIVIDE = """
                 inverse[32 * i + j] = sum / factor[32 * i + i];
             }
         for (int i = 0; i < 1024; ++i)
-            to[i] = good ? inverse[i] : (i % 33 == 0 ? 1.0 : 0.0);
+            to[i] = stored(good ? inverse[i] : (i % 33 == 0 ? 1.0 : 0.0));
         return good;
     };
-    auto multiply = [](double* target, const double* b) {
+    auto multiply = [](stored* target, const auto* source, const stored* b) {
         for (int i = 0; i < 32; ++i) {
             double answer[32] = {};
             for (int j = 0; j < 32; ++j)
                 for (int k = 0; k <= j; ++k)
-                    answer[j] += target[32 * i + k] * b[32 * j + k];
+                    answer[j] += double(stored(source[32 * i + k])) * b[32 * j + k];
             for (int j = 0; j < 32; ++j)
-                target[32 * i + j] = answer[j];
+                target[32 * i + j] = stored(answer[j]);
         }
     };
 #endif
@@ -334,29 +351,30 @@ _FACTORISE = (
     bool all_good = true;
 #ifdef PALPATE_TENSOR_CORES
     for (int c = 0; c < own; ++c) {
-        double* diagonal = tiles_of(c) + 1024 * c;
+        stored* diagonal = tiles_of(c) + 1024 * c;
         for (int half = 2 * c + warp; half < 2 * rows; half += warps)
             begin(tiles_of(half / 2) + 1024 * c, half / 2, c, half % 2, c);
         __syncthreads();
-        double mine[each];
+        stored mine[each];
         const bool good = invert(mine, diagonal);
         put(diagonal, mine, good);
         all_good = all_good && good;
         __syncthreads();
         for (int half = 2 * c + 2 + warp; half < 2 * rows; half += warps)
-            multiply(tiles_of(half / 2) + 1024 * c, diagonal, half % 2);
+            multiply(
+                tiles_of(half / 2) + 1024 * c, tiles_of(half / 2) + 1024 * c, diagonal, half % 2);
         __syncthreads();
     }
 #else
     if (thread != 0)
         return;
     for (int c = 0; c < own; ++c) {
-        double* diagonal = tiles_of(c) + 1024 * c;
+        stored* diagonal = tiles_of(c) + 1024 * c;
         for (int r = c; r < rows; ++r)
             begin(tiles_of(r) + 1024 * c, r, c, c);
         all_good = invert(diagonal, diagonal) && all_good;
         for (int r = c + 1; r < rows; ++r)
-            multiply(tiles_of(r) + 1024 * c, diagonal);
+            multiply(tiles_of(r) + 1024 * c, tiles_of(r) + 1024 * c, diagonal);
     }
 #endif
     if (thread == 0 && !all_good)
@@ -367,7 +385,7 @@ _FACTORISE = (
 _BEGIN_TILE = (
     _PANEL
     + """
-    double* target = r + c > 0 ? tiles_of(r) + 1024 * c : diagonals.data + size_t(diagonal) * 1024;
+    double* target = unfinished.data + (size_t(first_unfinished) + above(r) + c) * 1024;
 #ifdef PALPATE_TENSOR_CORES
     begin(target, r, c, thread / 32, 0);
 #else
@@ -382,27 +400,29 @@ _DIVIDE_COLUMN = (
     + FRONT
     + _DIVIDE
     + """
-    const double* from = diagonals.data + size_t(diagonal) * 1024;
-    double* to = tiles_of(c) + 1024 * c;
+    auto from_of = [=](int r) {
+        return unfinished.data + (size_t(first_unfinished) + above(r) + c) * 1024;
+    };
+    stored* to = tiles_of(c) + 1024 * c;
 #ifdef PALPATE_TENSOR_CORES
-    __shared__ __align__(16) double inverse[1024];
-    double mine[each];
-    const bool good = invert(mine, from);
+    __shared__ __align__(16) stored inverse[1024];
+    stored mine[each];
+    const bool good = invert(mine, from_of(c));
     put(inverse, mine, good);
     if (part == 0)
         put(to, mine, good);
     __syncthreads();
     for (int half = 2 * c + 2 + part * warps + warp; half < 2 * rows; half += parts * warps)
-        multiply(tiles_of(half / 2) + 1024 * c, inverse, half % 2);
+        multiply(tiles_of(half / 2) + 1024 * c, from_of(half / 2), inverse, half % 2);
     if (part == 0 && thread == 0 && !good)
         bad.data[slot] = 1;
 #else
     if (part > 0 || thread > 0)
         return;
-    if (!invert(to, from))
+    if (!invert(to, from_of(c)))
         bad.data[slot] = 1;
     for (int r = c + 1; r < rows; ++r)
-        multiply(tiles_of(r) + 1024 * c, to);
+        multiply(tiles_of(r) + 1024 * c, from_of(r), to);
 #endif
 """
 )
@@ -415,23 +435,27 @@ _INVERT_TRIANGLE = (
     // which are inverted.
 #ifdef PALPATE_TENSOR_CORES
     // Half of: sum += a times b
-    auto add_product_of = [=](double (&sum)[2][4][2], const double* a, const double* b) {
-        a += row * 32 + column;
-        b += column * 32 + row;
-        #pragma unroll 2
-        for (int k = 0; k < 32; k += 8, a += 8, b += 256) {
-            const double2 upper = pair_at(a), lower = pair_at(a + 256);
+    auto add_product_of = [=](double (&sum)[2][4][2], const stored* a, const stored* b) {
+        a += row * 32 + four;
+        b += four * 32 + row;
+        #pragma unroll 1
+        for (int k = 0; k < 32; k += 16, a += 16, b += 512) {
+            const Four upper = four_at(a), lower = four_at(a + 256);
             #pragma unroll
-            for (int n = 0; n < 4; ++n)
+            for (int n = 0; n < 4; ++n) {
+                const stored* at = b + 8 * n;
                 add_product(
-                    sum[0][n], sum[1][n], upper, lower, make_double2(b[8 * n], b[8 * n + 32]));
+                    sum[0][n], sum[1][n], upper.first, lower.first, make_double2(at[0], at[32]));
+                add_product(
+                    sum[0][n], sum[1][n], upper.second, lower.second, make_double2(at[64], at[96]));
+            }
         }
     };
     constexpr int warps = WP_TILE_BLOCK_DIM / 32;
     const int warp = thread / 32;
     for (int c = corner + 1; c < end; ++c) {
-        double* tiles_in_row = tiles_of(c);
-        const double* diagonal = tiles_in_row + 1024 * c;
+        stored* tiles_in_row = tiles_of(c);
+        const stored* diagonal = tiles_in_row + 1024 * c;
         // Warps of one round read what they overwrite; later ones read none of it.
         for (int first = 2 * corner; first < 2 * c; first += warps) {
             const int j = (first + warp) / 2, half = warp % 2;
@@ -458,26 +482,26 @@ _INVERT_TRIANGLE = (
 #else
     if (thread != 0)
         return;
-    auto add_product_of = [](double* sum, const double* a, const double* b) {
+    auto add_product_of = [](double* sum, const stored* a, const stored* b) {
         for (int i = 0; i < 32; ++i)
             for (int j = 0; j < 32; ++j)
                 for (int k = 0; k < 32; ++k)
-                    sum[32 * i + j] += a[32 * i + k] * b[32 * k + j];
+                    sum[32 * i + j] += double(a[32 * i + k]) * b[32 * k + j];
     };
     for (int c = corner + 1; c < end; ++c) {
-        double* tiles_in_row = tiles_of(c);
+        stored* tiles_in_row = tiles_of(c);
         for (int j = corner; j < c; ++j) {
             double sum[1024] = {};
             add_product_of(sum, tiles_in_row + 1024 * c, tiles_in_row + 1024 * j);
             for (int i = 0; i < 1024; ++i)
-                tiles_in_row[1024 * j + i] = -sum[i];
+                tiles_in_row[1024 * j + i] = stored(-sum[i]);
         }
         for (int j = corner; j < c; ++j) {
             double sum[1024] = {};
             for (int k = j; k < c; ++k)
                 add_product_of(sum, tiles_in_row + 1024 * k, tiles_of(k) + 1024 * j);
             for (int i = 0; i < 1024; ++i)
-                tiles_in_row[1024 * j + i] = sum[i];
+                tiles_in_row[1024 * j + i] = stored(sum[i]);
         }
     }
 #endif
@@ -488,11 +512,9 @@ _SUBTRACT_COLUMN = (
     _PRODUCTS
     + FRONT
     + """
-    double* tile = tiles_of(r) + 1024 * j;
-    const double* a = tiles_of(r) + 1024 * c;
-    const double* b = tiles_of(j) + 1024 * c;
-    double* target
-        = r == c + 1 && j == c + 1 ? diagonals.data + size_t(diagonal) * 1024 : tile;
+    double* tile = unfinished.data + (size_t(first_unfinished) + above(r) + j) * 1024;
+    const stored* a = tiles_of(r) + 1024 * c;
+    const stored* b = tiles_of(j) + 1024 * c;
 #ifdef PALPATE_TENSOR_CORES
     const int half = thread / 32;
     double sum[2][4][2];
@@ -500,14 +522,15 @@ _SUBTRACT_COLUMN = (
     for (int m = 0; m < 2; ++m)
         #pragma unroll
         for (int n = 0; n < 4; ++n) {
-            const double2 before = pair_at(tile + 512 * half + (8 * m + row) * 32 + 8 * n + column);
+            const double2 before = *reinterpret_cast<const double2*>(
+                tile + 512 * half + (8 * m + row) * 32 + 8 * n + column);
             sum[m][n][0] = -before.x;
             sum[m][n][1] = -before.y;
         }
-    subtract(sum, target, a, b, 1, half);
+    subtract(sum, tile, a, b, 1, half);
 #else
     if (thread == 0)
-        subtract(target, a, b, 1, [=](int i, int k) { return tile[32 * i + k]; });
+        subtract(tile, a, b, 1, [=](int i, int k) { return tile[32 * i + k]; });
 #endif
 """
 )
@@ -520,11 +543,11 @@ def subtract_product(
     child: int,
     last_child: int,
     first_share: int,
-    panels: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float32),
     left: int,
     right: int,
     count: int,
-    shares: wp.array3d(dtype=wp.float64),
+    shares: wp.array3d(dtype=wp.float32),
     tile: int,
     r: int,
     c: int,
@@ -547,13 +570,13 @@ def factorise_panel(
     child: int,
     last_child: int,
     first_share: int,
-    shares: wp.array3d(dtype=wp.float64),
+    shares: wp.array3d(dtype=wp.float32),
     sources_at: wp.array(dtype=wp.int32),
     sources: wp.array(dtype=wp.int32),
     first_tile: int,
     values: wp.array2d(dtype=wp.float64),
     slot: int,
-    panels: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float32),
     panel: int,
     own: int,
     rows: int,
@@ -578,45 +601,46 @@ def begin_tile(
     child: int,
     last_child: int,
     first_share: int,
-    shares: wp.array3d(dtype=wp.float64),
+    shares: wp.array3d(dtype=wp.float32),
     sources_at: wp.array(dtype=wp.int32),
     sources: wp.array(dtype=wp.int32),
     first_tile: int,
     values: wp.array2d(dtype=wp.float64),
     slot: int,
-    panels: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float32),
     panel: int,
     own: int,
     r: int,
     c: int,
-    diagonals: wp.array3d(dtype=wp.float64),
-    diagonal: int,
+    unfinished: wp.array3d(dtype=wp.float64),
+    first_unfinished: int,
     thread: int,
 ):
-    """Gather tile (r, c) of a front's panel; the first one into ``diagonals``. For two warps.
+    """Gather tile (r, c) of a front's panel into ``unfinished``. For two warps.
 
     With `divide_column` and `subtract_column` for each column after it, the same numbers in the
-    same order as `factorise_panel`, to the bit, by as many blocks of threads as there are.
+    same order as `factorise_panel`, to the bit, by as many blocks of threads as there are: sums
+    that are not complete keep their precision. The front's tiles are ``first_unfinished`` and on.
     """
     ...
 
 
 @wp.func_native(_DIVIDE_COLUMN)
 def divide_column(
-    panels: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float32),
     panel: int,
     own: int,
     rows: int,
     c: int,
-    diagonals: wp.array3d(dtype=wp.float64),
-    diagonal: int,
+    unfinished: wp.array3d(dtype=wp.float64),
+    first_unfinished: int,
     part: int,
     parts: int,
     slot: int,
     bad: wp.array(dtype=wp.int32),
     thread: int,
 ):
-    """Invert the factor of a diagonal tile, which is in ``diagonals``; divide the column below.
+    """Invert the factor of a diagonal tile, and divide the column below it: ``unfinished`` no more.
 
     For ``parts`` blocks of threads, each of which inverts it, since to wait for one takes longer.
     """
@@ -625,26 +649,23 @@ def divide_column(
 
 @wp.func_native(_SUBTRACT_COLUMN)
 def subtract_column(
-    panels: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float32),
     panel: int,
     own: int,
     c: int,
     r: int,
     j: int,
-    diagonals: wp.array3d(dtype=wp.float64),
-    diagonal: int,
+    unfinished: wp.array3d(dtype=wp.float64),
+    first_unfinished: int,
     thread: int,
 ):
-    """Subtract column c's product from tile (r, j); the next diagonal's goes into ``diagonals``.
-
-    For two warps.
-    """
+    """Subtract column c's product from tile (r, j), which is ``unfinished``. For two warps."""
     ...
 
 
 @wp.func_native(_INVERT_TRIANGLE)
 def invert_triangle(
-    panels: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float32),
     panel: int,
     own: int,
     corner: int,

@@ -18,14 +18,14 @@ _VECTORS = (
     TENSOR_CORES
     + FRONT
     + """
-    double* result = out.data + size_t(out_row) * 2;
-    const double* known = source.data + size_t(source_row) * 2;
+    stored* result = out.data + size_t(out_row) * 2;
+    const stored* known = source.data + size_t(source_row) * 2;
 #ifdef PALPATE_TENSOR_CORES
     constexpr int parts = PARTS;
     const int lane = thread % 32, part = thread / 32;
-    const int row = lane / 4, column = 2 * (lane % 4);
+    const int row = lane / 4, column = 2 * (lane % 4), four = 4 * (lane % 4);
     // The threads of columns 0 and 1 of B hold 32 rows of two numbers, the others zeros.
-    auto number = [=](const double* from, int k) { return row < 2 ? from[2 * k + row] : 0.0; };
+    auto number = [=](const stored* from, int k) { return row < 2 ? from[2 * k + row] : 0.f; };
     // Write what the warps have found: their sums stand at the threads with column 0.
     auto finish = [=](const double (&sum)[4][2], auto place_of) {
         __shared__ double shared[WP_TILE_BLOCK_DIM / 32][64];
@@ -49,19 +49,22 @@ _VECTORS = (
 _MULTIPLY_ROW = (
     _VECTORS
     + """
-    const double* tile = tiles_of(r);
+    const stored* tile = tiles_of(r);
 #ifdef PALPATE_TENSOR_CORES
     double sum[4][2] = {};
+    #pragma unroll 2
     for (int c = first + part; c < last; c += parts)
         #pragma unroll
-        for (int k = 0; k < 32; k += 8) {
-            const double* from = known + 64 * c;
-            const double2 factor
-                = make_double2(number(from, k + column), number(from, k + column + 1));
+        for (int k = four; k < 32; k += 16) {
+            const stored* from = known + 64 * c;
+            const double2 first = make_double2(number(from, k), number(from, k + 1));
+            const double2 second = make_double2(number(from, k + 2), number(from, k + 3));
             #pragma unroll
             for (int m = 0; m < 4; m += 2) {
-                const double* at = tile + 1024 * c + (8 * m + row) * 32 + k + column;
-                add_product(sum[m], sum[m + 1], pair_at(at), pair_at(at + 256), factor);
+                const stored* at = tile + 1024 * c + (8 * m + row) * 32 + k;
+                const Four upper = four_at(at), lower = four_at(at + 256);
+                add_product(sum[m], sum[m + 1], upper.first, lower.first, first);
+                add_product(sum[m], sum[m + 1], upper.second, lower.second, second);
             }
         }
     finish(sum, [=](int m) { return 2 * (8 * m + row); });
@@ -84,25 +87,26 @@ _MULTIPLY_COLUMN = (
     + """
 #ifdef PALPATE_TENSOR_CORES
     double sum[4][2] = {};
+    #pragma unroll 2
     for (int r = first + part; r < last; r += parts) {
-        const double* tile = tiles_of(r) + 1024 * c;
-        const double* from = known + 64 * r;
+        const stored* tile = tiles_of(r) + 1024 * c;
+        const stored* from = known + 64 * r;
         #pragma unroll
         for (int i = 0; i < 32; i += 8) {
             const int k = i + lane % 4;
             const double2 factor = make_double2(number(from, k), number(from, k + 4));
-            #pragma unroll
-            for (int m = 0; m < 4; m += 2) {
-                const double2 one = pair_at(tile + k * 32 + 8 * m + 2 * row);
-                const double2 other = pair_at(tile + (k + 4) * 32 + 8 * m + 2 * row);
-                add_product(
-                    sum[m], sum[m + 1], make_double2(one.x, other.x), make_double2(one.y, other.y),
-                    factor);
-            }
+            const Four one = four_at(tile + k * 32 + 4 * row);
+            const Four other = four_at(tile + (k + 4) * 32 + 4 * row);
+            add_product(
+                sum[0], sum[1], make_double2(one.first.x, other.first.x),
+                make_double2(one.first.y, other.first.y), factor);
+            add_product(
+                sum[2], sum[3], make_double2(one.second.x, other.second.x),
+                make_double2(one.second.y, other.second.y), factor);
         }
     }
-    // Two rows of a pair are neighbours of the column.
-    finish(sum, [=](int m) { return 2 * (8 * (m - m % 2) + 2 * row + m % 2); });
+    // The four numbers of a load are neighbours of the column.
+    finish(sum, [=](int m) { return 2 * (4 * row + m); });
 #else
     if (thread != 0)
         return;
@@ -120,15 +124,15 @@ _MULTIPLY_COLUMN = (
 
 @wp.func_native(_MULTIPLY_ROW)
 def multiply_row(
-    panels: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float32),
     panel: int,
     own: int,
     r: int,
     first: int,
     last: int,
-    source: wp.array2d(dtype=wp.float64),
+    source: wp.array2d(dtype=wp.float32),
     source_row: int,
-    out: wp.array2d(dtype=wp.float64),
+    out: wp.array2d(dtype=wp.float32),
     out_row: int,
     subtract: int,
     thread: int,
@@ -144,15 +148,15 @@ def multiply_row(
 
 @wp.func_native(_MULTIPLY_COLUMN)
 def multiply_column(
-    panels: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float32),
     panel: int,
     own: int,
     c: int,
     first: int,
     last: int,
-    source: wp.array2d(dtype=wp.float64),
+    source: wp.array2d(dtype=wp.float32),
     source_row: int,
-    out: wp.array2d(dtype=wp.float64),
+    out: wp.array2d(dtype=wp.float32),
     out_row: int,
     subtract: int,
     thread: int,

@@ -31,6 +31,7 @@ class FrontTiles:
     Attributes:
         tree: Order and fronts.
         level: Of each front; leaves have 0.
+        panels: Tiles of each front's panel.
         panel_tiles: Tiles of all panels of one matrix.
         share_tiles: Tiles of all shares of one matrix.
         rows: Rows of all fronts, own and border, for one right-hand side.
@@ -52,7 +53,7 @@ class FrontTiles:
         self.own_tiles, self.border_tiles = -(-own // TILE), -(-border // TILE)
         o, b = self.own_tiles, self.border_tiles
         panel, share = o * (o + 1) // 2 + b * o, b * (b + 1) // 2
-        self.panel_tiles, self.share_tiles = int(panel.sum()), int(share.sum())
+        self.panels, self.panel_tiles, self.share_tiles = panel, int(panel.sum()), int(share.sum())
         self.rows = int(((o + b) * TILE).sum())
         self.level = np.zeros(count, np.int64)
         for k in range(count):  # children stand before parents
@@ -150,25 +151,29 @@ class BatchedFactor:
         self._sequences = Sequences(device)
         self._processors = wp.get_device(device).sm_count if self.values.device.is_cuda else 0
         self.few = self._processors // 4 if few is None else few
-        self._columns = columns
         # Of each level: the widest front, and the most rows, in tiles.
         self._largest = [
             tiles.fronts[tiles.level == level, :2].max(axis=0).tolist()
             for level in range(tiles.levels)
         ]
+        self._wide = [k for k, (own, _) in enumerate(self._largest) if own >= columns]
         self.bad = wp.zeros(slots, dtype=wp.int32, device=device)
         self.marked = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
         square = (TILE, TILE)
         self._panels = wp.zeros(
-            (slots * tiles.panel_tiles, *square), dtype=wp.float64, device=device
+            (slots * tiles.panel_tiles, *square), dtype=wp.float32, device=device
         )
         self._shares = wp.zeros(
-            (slots * tiles.share_tiles, *square), dtype=wp.float64, device=device
+            (slots * tiles.share_tiles, *square), dtype=wp.float32, device=device
         )
-        self._diagonals = wp.zeros((self.few, *square), dtype=wp.float64, device=device)
+        # Of fronts that are factorised by columns, before a column is divided.
+        wide = [tiles.panels[tiles.level == level] for level in self._wide]
+        self._room = int(max((panels.max() for panels in wide), default=0))
+        fronts = min(self.few, slots * max((len(panels) for panels in wide), default=0))
+        self._unfinished = wp.zeros((fronts * self._room, *square), dtype=wp.float64, device=device)
         shape = (slots * tiles.rows, LANES)
-        self._begun = wp.zeros(shape, dtype=wp.float64, device=device)
-        self._half = wp.zeros(shape, dtype=wp.float64, device=device)
+        self._begun = wp.zeros(shape, dtype=wp.float32, device=device)
+        self._half = wp.zeros(shape, dtype=wp.float32, device=device)
         self._loaded = wp.zeros_like(self.marked)
         self._fronts = self._ints(tiles.fronts)
         self._children = self._ints(tiles.children)
@@ -188,7 +193,7 @@ class BatchedFactor:
             "levels": float(tiles.levels),
             "gflop": tiles.tree.flop / 1e9,
             "padded_gflop": tiles.gflop,
-            "mib_a_slot": 8.0 * (stored * TILE**2 + 2 * tiles.rows * LANES) / 2**20,
+            "mib_a_slot": (4.0 * stored * TILE**2 + 16.0 * tiles.rows * LANES) / 2**20,
         }
 
     def factorise(self, slots: wp.array) -> None:
@@ -205,8 +210,7 @@ class BatchedFactor:
             begin = [slots, self.marked, self._by_level, *plan, self._sources_at, self._sources,
                      first]  # fmt: skip
             known = [*sizes, self.values, self._shares]
-            wide = self._largest[level][0] >= self._columns
-            if wide and (last - first) * count <= self.few:
+            if level in self._wide and (last - first) * count <= self.few:
                 self._factorise_by_columns(level, slots, begin, known)
             else:
                 self._launch(
@@ -236,13 +240,13 @@ class BatchedFactor:
         """Factorise panels column by column, each by as many blocks of threads as it can use."""
         first, last = self._front_begins[level : level + 2]
         width, height = self._largest[level]
-        shape = (last - first, len(slots))
+        shape, panel_tiles = (last - first, len(slots)), self.tiles.panel_tiles
         fronts = [slots, self.marked, self._by_level, self._fronts, first]
         self._launch(
             kernels.begin_panels,
             (*shape, width * height, 2 * TILE),
-            [*begin, width, *known],
-            [self._panels, self._diagonals],
+            [*begin, width, *known, self._panels, self._room],
+            [self._unfinished],
         )
         for column in range(width):
             below = height - column - 1
@@ -250,14 +254,14 @@ class BatchedFactor:
             self._launch(
                 kernels.divide_columns,
                 (*shape, parts, THREADS),
-                [*fronts, column, parts, self.tiles.panel_tiles, self._diagonals],
+                [*fronts, column, parts, panel_tiles, self._room, self._unfinished],
                 [self._panels, self.bad],
             )
             self._launch(
                 kernels.subtract_columns,
                 (*shape, (width - column - 1) * below, 2 * TILE),
-                [*fronts, column, width, self.tiles.panel_tiles],
-                [self._panels, self._diagonals],
+                [*fronts, column, width, panel_tiles, self._panels, self._room],
+                [self._unfinished],
             )
 
     def _block(self, fronts: int) -> int:

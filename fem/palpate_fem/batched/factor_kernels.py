@@ -87,8 +87,8 @@ def factorise_panels(
     panel_tiles: int,
     share_tiles: int,
     values_in: wp.array2d(dtype=wp.float64),
-    shares_in: wp.array3d(dtype=wp.float64),
-    panels: wp.array3d(dtype=wp.float64),
+    shares_in: wp.array3d(dtype=wp.float32),
+    panels: wp.array3d(dtype=wp.float32),
     bad: wp.array(dtype=wp.int32),
 ):
     """Gather and factorise the own columns of fronts: a block of threads for each.
@@ -127,9 +127,10 @@ def begin_panels(
     panel_tiles: int,
     share_tiles: int,
     values_in: wp.array2d(dtype=wp.float64),
-    shares_in: wp.array3d(dtype=wp.float64),
-    panels: wp.array3d(dtype=wp.float64),
-    diagonals: wp.array3d(dtype=wp.float64),
+    shares_in: wp.array3d(dtype=wp.float32),
+    panels_in: wp.array3d(dtype=wp.float32),
+    room: int,
+    unfinished: wp.array3d(dtype=wp.float64),
 ):
     """Gather the own columns of fronts, at most ``width`` of tiles: two warps for a tile."""
     number, i, tile, thread = wp.tid()
@@ -143,8 +144,8 @@ def begin_panels(
         dense_tiles.begin_tile(
             children, rows_in_child, fronts[front, 2], fronts[front, 3], slot * share_tiles,
             shares_in, sources_at, sources, first_tile, values_in, slot,
-            panels, slot * panel_tiles + first_tile, own, r, c,
-            diagonals, number * slots.shape[0] + i, thread,
+            panels_in, slot * panel_tiles + first_tile, own, r, c,
+            unfinished, (number * slots.shape[0] + i) * room, thread,
         )  # fmt: skip
 
 
@@ -158,8 +159,9 @@ def divide_columns(
     column: int,
     parts: int,
     panel_tiles: int,
-    diagonals_in: wp.array3d(dtype=wp.float64),
-    panels: wp.array3d(dtype=wp.float64),
+    room: int,
+    unfinished_in: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float32),
     bad: wp.array(dtype=wp.int32),
 ):
     """Factorise the diagonal tile of a column of fronts, and divide by it what is below."""
@@ -171,7 +173,8 @@ def divide_columns(
         panel = slot * panel_tiles + fronts[front, 4]
         dense_tiles.divide_column(
             panels, panel, own, fronts[front, 1], column,
-            diagonals_in, number * slots.shape[0] + i, part, parts, slot, bad, thread,
+            unfinished_in, (number * slots.shape[0] + i) * room,
+            part, parts, slot, bad, thread,
         )  # fmt: skip
 
 
@@ -185,8 +188,9 @@ def subtract_columns(
     column: int,
     width: int,
     panel_tiles: int,
-    panels: wp.array3d(dtype=wp.float64),
-    diagonals: wp.array3d(dtype=wp.float64),
+    panels_in: wp.array3d(dtype=wp.float32),
+    room: int,
+    unfinished: wp.array3d(dtype=wp.float64),
 ):
     """Subtract a column's products from the columns after it: two warps for a tile."""
     number, i, tile, thread = wp.tid()
@@ -198,12 +202,12 @@ def subtract_columns(
     j = column + 1 + tile % left
     if marked[slot, front] != 0 and j < own and j <= r and r < fronts[front, 1]:
         dense_tiles.subtract_column(
-            panels, slot * panel_tiles + fronts[front, 4], own, column, r, j,
-            diagonals, number * slots.shape[0] + i, thread,
+            panels_in, slot * panel_tiles + fronts[front, 4], own, column, r, j,
+            unfinished, (number * slots.shape[0] + i) * room, thread,
         )  # fmt: skip
 
 
-@wp.kernel(launch_bounds=(THREADS, 2))
+@wp.kernel(launch_bounds=(THREADS, 3))
 def subtract_products(
     slots: wp.array(dtype=wp.int32),
     marked: wp.array2d(dtype=wp.int32),
@@ -214,8 +218,8 @@ def subtract_products(
     first: int,
     panel_tiles: int,
     share_tiles: int,
-    panels_in: wp.array3d(dtype=wp.float64),
-    shares: wp.array3d(dtype=wp.float64),
+    panels_in: wp.array3d(dtype=wp.float32),
+    shares: wp.array3d(dtype=wp.float32),
 ):
     """Set tiles of shares to what the children's shares add up to, less the product of two rows.
 
@@ -247,7 +251,7 @@ def invert_triangles(
     listed: wp.array2d(dtype=wp.int32),
     fronts: wp.array2d(dtype=wp.int32),
     panel_tiles: int,
-    panels: wp.array3d(dtype=wp.float64),
+    panels: wp.array3d(dtype=wp.float32),
 ):
     """Invert triangles on the diagonals of fronts; ``listed`` has the front and the first tile."""
     number, i, thread = wp.tid()

@@ -30,7 +30,7 @@ def gather_loads(
     rows: int,
     lanes: int,
     vectors_in: wp.array3d(dtype=wp.float64),
-    begun: wp.array2d(dtype=wp.float64),
+    begun: wp.array2d(dtype=wp.float32),
     loaded: wp.array2d(dtype=wp.int32),
 ):
     """Begin the rows of fronts with right-hand sides and what the children's borders add up to.
@@ -54,8 +54,8 @@ def gather_loads(
                 for child in range(fronts[front, 2], fronts[front, 3]):
                     there = rows_in_child[children[child, 0] + at]
                     if there >= 0:
-                        total += begun[base + children[child, 2] + there, lane]
-            begun[base + row, lane] = total
+                        total += wp.float64(begun[base + children[child, 2] + there, lane])
+            begun[base + row, lane] = wp.float32(total)
             if own and total != wp.float64(0.0):
                 loaded[slot, front] = 1
 
@@ -71,9 +71,9 @@ def solve_rows(
     subtract: int,
     panel_tiles: int,
     rows: int,
-    panels_in: wp.array3d(dtype=wp.float64),
-    source: wp.array2d(dtype=wp.float64),
-    out: wp.array2d(dtype=wp.float64),
+    panels_in: wp.array3d(dtype=wp.float32),
+    source: wp.array2d(dtype=wp.float32),
+    out: wp.array2d(dtype=wp.float32),
 ):
     """Solve with inverse triangles that begin at tile ``corner``: a row of tiles each.
 
@@ -102,7 +102,7 @@ def gather_answers(
     row_links: wp.array(dtype=wp.int32),
     first: int,
     rows: int,
-    begun: wp.array2d(dtype=wp.float64),
+    begun: wp.array2d(dtype=wp.float32),
 ):
     """Bring what is solved above to the borders of fronts."""
     i, number, at = wp.tid()
@@ -111,7 +111,7 @@ def gather_answers(
         base = slots[i] * rows
         row = fronts[front, 6] + at
         for lane in range(wp.static(LANES)):
-            value = wp.float64(0.0)
+            value = wp.float32(0.0)
             if row_links[row] >= 0:
                 value = begun[base + row_links[row], lane]
             begun[base + row, lane] = value
@@ -127,9 +127,9 @@ def solve_columns(
     subtract: int,
     panel_tiles: int,
     rows: int,
-    panels_in: wp.array3d(dtype=wp.float64),
-    source: wp.array2d(dtype=wp.float64),
-    out: wp.array2d(dtype=wp.float64),
+    panels_in: wp.array3d(dtype=wp.float32),
+    source: wp.array2d(dtype=wp.float32),
+    out: wp.array2d(dtype=wp.float32),
 ):
     """Solve with transposed inverse triangles: a column of tiles each.
 
@@ -154,10 +154,10 @@ def scatter_solution(
     slots: wp.array(dtype=wp.int32),
     row_of: wp.array(dtype=wp.int32),
     rows: int,
-    begun_in: wp.array2d(dtype=wp.float64),
+    begun_in: wp.array2d(dtype=wp.float32),
     solution_out: wp.array3d(dtype=wp.float64),
 ):
     """Write the solution in the caller's order."""
     i, lane, k = wp.tid()
     slot = slots[i]
-    solution_out[slot, lane, k] = begun_in[slot * rows + row_of[k], lane]
+    solution_out[slot, lane, k] = wp.float64(begun_in[slot * rows + row_of[k], lane])
