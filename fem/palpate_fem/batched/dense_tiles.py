@@ -4,15 +4,16 @@
 What a front takes from its children's shares, and from the matrix, it gathers where it needs it:
 sums begin with that, products are subtracted, and a tile is written once.
 
-Double precision. On a GPU from compute capability 8.0 on a warp of threads works on a tile with the
-tensor cores and loads what they take from memory straight into registers: `warp.tile_matmul` goes
-through shared memory, whose banks conflict for rows of 256 bytes. On a CPU, and on older GPUs, a
-front is worked on by one thread.
+Tiles are kept in single precision, as half the bytes take half the time, and sums are added up in
+double. On a GPU from compute capability 8.0 on a warp of threads works on a tile with the tensor
+cores and loads what they take from memory straight into registers: `warp.tile_matmul` goes through
+shared memory, whose banks conflict. On a CPU, and on older GPUs, a front is worked on by one thread.
 
 What the tensor cores add is C (16 x 8) += A (16 x 8) B (8 x 8). Thread t of the warp holds, with
 g = t / 4 and s = t % 4: A in rows g and g + 8, B in column g, C in rows g and g + 8 and columns 2 s
 and 2 s + 1. Which eight of the summed numbers meet in one product does not matter, so a thread
-takes two neighbours of a row, which it loads at once. A GPU before 9.0 does it in four parts.
+takes four neighbours of a row, which it loads at once, for two products. A GPU before 9.0 does each
+in four parts.
 """
 
 from __future__ import annotations

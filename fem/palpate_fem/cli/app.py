@@ -88,7 +88,7 @@ SlotsOption = Annotated[
     typer.Option(
         "--slots",
         min=1,
-        help="--device: trajectories at once [default: 128], 0.35 GB each.",
+        help="--device: trajectories at once [default: 128], 0.22 GB each.",
     ),
 ]
 SlopesOption = Annotated[
@@ -458,7 +458,7 @@ def serve(
     ] = None,
     slots: Annotated[
         int | None,
-        typer.Option(min=1, help="--device: requests at once [default: 16], 0.35 GB each."),
+        typer.Option(min=1, help="--device: requests at once [default: 16], 0.22 GB each."),
     ] = None,
     waiting: Annotated[int, typer.Option(min=0, help="Most requests that wait.")] = 8,
     max_deadline_s: Annotated[

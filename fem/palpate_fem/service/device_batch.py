@@ -54,7 +54,7 @@ from palpate_fem.store.content import StoredFingertip
 _log = logging.getLogger(__name__)
 
 SLOTS = 128
-"""Trajectories at once on a device: more gain little there, and each takes 0.35 GB."""
+"""Trajectories at once on a device: more gain little there, and each takes 0.22 GB."""
 
 SLOTFULS = 2
 """Times its slots that a device has trajectories: as many wait there as are at work."""

@@ -167,7 +167,7 @@ class DeviceWorker:
                 raise
             raise SimulationError(
                 f"{setup.slots} slots cannot be had on {setup.device}: {error}",
-                remedy="give fewer --slots; each takes about 0.35 GB",
+                remedy="give fewer --slots; each takes about 0.22 GB",
             ) from error
         self._outbox.put(DeviceReady())
         return solver
