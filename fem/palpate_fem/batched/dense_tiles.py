@@ -7,7 +7,7 @@ sums begin with that, products are subtracted, and a tile is written once.
 Tiles are kept in single precision, as half the bytes take half the time, and sums are added up in
 double. On a GPU from compute capability 8.0 on a warp of threads works on a tile with the tensor
 cores and loads what they take from memory straight into registers: `warp.tile_matmul` goes through
-shared memory, whose banks conflict. On a CPU, and on older GPUs, a front is worked on by one thread.
+shared memory, whose banks conflict. On a CPU, and on older GPUs, one thread works on a front.
 
 What the tensor cores add is C (16 x 8) += A (16 x 8) B (8 x 8). Thread t of the warp holds, with
 g = t / 4 and s = t % 4: A in rows g and g + 8, B in column g, C in rows g and g + 8 and columns 2 s
