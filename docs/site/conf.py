@@ -8,13 +8,17 @@ Why it is built so: docs/adr/0032-documentation-site.md.
 
 from __future__ import annotations
 
+import functools
 import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sphinx.addnodes import toctree
+
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
+    from sphinx.environment import BuildEnvironment
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / room) for room in ("protos", "fem", "training")]
@@ -122,6 +126,38 @@ def _add_navigation(app: Sphinx, page: str, source: list[str]) -> None:
         source[0] += "\n\n```{toctree}\n" + "\n".join(lines) + "\n```\n"
 
 
+def _list_titles(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: object
+) -> None:
+    """Spare each page a copy of all sections of all pages: its navigation shows titles alone."""
+    navigation = context["toctree"]
+
+    def of_titles(**options: Any) -> Any:
+        whole = app.env.tocs
+        if options.get("titles_only"):
+            app.env.tocs = _without_sections(app.env)
+        try:
+            return navigation(**options)
+        finally:
+            app.env.tocs = whole
+
+    context["toctree"] = of_titles
+
+
+@functools.cache
+def _without_sections(env: BuildEnvironment) -> dict[str, Any]:
+    """Contents of each page as Sphinx leaves them of its copies: the title, and pages below it."""
+    found = {page: contents.deepcopy() for page, contents in env.tocs.items()}
+    for contents in found.values():
+        for entry in contents:
+            if len(entry) > 1:
+                if below := list(entry.findall(toctree)):
+                    entry[1][:] = below
+                else:
+                    entry.pop(1)
+    return found
+
+
 def _keep_colons(
     app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]
 ) -> None:
@@ -140,6 +176,7 @@ def _first_page(app: Sphinx, failure: Exception | None) -> None:
 def setup(app: Sphinx) -> dict[str, Any]:
     """Called by Sphinx."""
     app.connect("source-read", _add_navigation)
+    app.connect("html-page-context", _list_titles)
     app.connect("autodoc-process-docstring", _keep_colons, priority=100)
     app.connect("build-finished", _first_page)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

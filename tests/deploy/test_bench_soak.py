@@ -39,37 +39,42 @@ for _ in range(600):
 """
 
 
-def watched(what: str, seconds: float = 4.0) -> History:
-    child = subprocess.Popen([sys.executable, "-c", _PROGRAM, what])
-    history = History()
+@pytest.fixture(scope="module")
+def watched() -> dict[str, History]:
+    """Four seconds of a process of each kind, all of them at the same time."""
+    kinds = ("leaks", "opens", "sleeps")
+    children = {kind: subprocess.Popen([sys.executable, "-c", _PROGRAM, kind]) for kind in kinds}
+    histories = {kind: History() for kind in kinds}
     try:
         time.sleep(0.5)
         begun = time.monotonic()
-        while (gone := time.monotonic() - begun) < seconds:
-            use = use_of(child.pid)
-            assert use is not None
-            history.add(gone, child.pid, use)
+        while (gone := time.monotonic() - begun) < 4.0:
+            for kind, child in children.items():
+                use = use_of(child.pid)
+                assert use is not None
+                histories[kind].add(gone, child.pid, use)
             time.sleep(0.05)
     finally:
-        child.kill()
-        child.wait()
-    return history
+        for child in children.values():
+            child.kill()
+            child.wait()
+    return histories
 
 
-def test_a_process_that_leaks_is_found() -> None:
-    growth = watched("leaks").growth(0.5)
+def test_a_process_that_leaks_is_found(watched: dict[str, History]) -> None:
+    growth = watched["leaks"].growth(0.5)
     assert growth.verdict is Verdict.GROWS
     assert not growth.fine
 
 
-def test_a_process_that_opens_files_is_found() -> None:
-    growth = watched("opens").growth(0.5)
+def test_a_process_that_opens_files_is_found(watched: dict[str, History]) -> None:
+    growth = watched["opens"].growth(0.5)
     assert not growth.constant
     assert not growth.fine
 
 
-def test_a_process_that_keeps_still_is_not() -> None:
-    growth = watched("sleeps").growth(0.5)
+def test_a_process_that_keeps_still_is_not(watched: dict[str, History]) -> None:
+    growth = watched["sleeps"].growth(0.5)
     assert growth.constant
     assert growth.slope_mb_per_h == pytest.approx(0.0, abs=1e-6)
     assert growth.verdict is Verdict.STEADY

@@ -46,19 +46,22 @@ class _LazyGroup(typer.core.TyperGroup):
     """A group whose commands are imported when one is used, not when palpate starts."""
 
     room = ""
+    _found: dict[str, Any] | None = None
 
     @property  # type: ignore[override]
     def commands(self) -> dict[str, Any]:
-        """The room's commands.
+        """The room's commands, which are put together once.
 
         Raises:
             MissingExtraError: The training extra is not installed.
         """
-        apps = [_app(self.room)] + ([twin_app] if self.room == "data" else [])
-        found: dict[str, Any] = {}
-        for app in apps:
-            found |= typer.main.get_command(app).commands  # type: ignore[attr-defined]
-        return found
+        if self._found is None:
+            apps = [_app(self.room)] + ([twin_app] if self.room == "data" else [])
+            found: dict[str, Any] = {}
+            for app in apps:
+                found |= typer.main.get_command(app).commands  # type: ignore[attr-defined]
+            self._found = found
+        return self._found
 
     @commands.setter
     def commands(self, value: dict[str, Any]) -> None:
@@ -186,7 +189,7 @@ def data_generate(
     ] = None,
     slots: Annotated[
         int | None,
-        typer.Option(min=1, help="--device: trajectories at once [default: 128], 0.35 GB each."),
+        typer.Option(min=1, help="--device: trajectories at once [default: 128], 0.22 GB each."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

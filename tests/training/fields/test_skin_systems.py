@@ -32,8 +32,8 @@ def held(mixed: MixedDataset) -> RowSplit:
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch, quick: FieldFitConfig) -> None:
     """Trainings of seconds: what is tested is that a system learns, not how well it can."""
-    set_points(monkeypatch, fields, epochs=50)
-    set_points(monkeypatch, synthesis, epochs=25)
+    set_points(monkeypatch, fields, epochs=15)
+    set_points(monkeypatch, synthesis, epochs=12, learning_rate=1e-3)
     monkeypatch.setattr(latent, "LATENT_CONFIG", replace(latent.LATENT_CONFIG, epochs=120))
     monkeypatch.setattr(
         synthesis, "RUPPEL_CONFIG", replace(ruppel.CONFIG, epochs=15, patience=15, batch_rows=64)
@@ -42,9 +42,20 @@ def short(monkeypatch: pytest.MonkeyPatch, quick: FieldFitConfig) -> None:
         monkeypatch.setattr(module, "FieldFitConfig", partial(replace, quick))
 
 
-def set_points(monkeypatch: pytest.MonkeyPatch, module: ModuleType, *, epochs: int) -> None:
+def set_points(
+    monkeypatch: pytest.MonkeyPatch,
+    module: ModuleType,
+    *,
+    epochs: int,
+    learning_rate: float = 2e-3,
+) -> None:
+    """An epoch costs the same however many steps it has, so few epochs have many of them."""
     config = replace(
-        synthesis.POINTS_CONFIG, epochs=epochs, patience=epochs, batch_rows=32, learning_rate=2e-3
+        synthesis.POINTS_CONFIG,
+        epochs=epochs,
+        patience=epochs,
+        batch_rows=8,
+        learning_rate=learning_rate,
     )
     monkeypatch.setattr(module, "POINTS_CONFIG", config)
 
