@@ -87,12 +87,10 @@ class Bench:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _rest_of_the_process() -> Iterator[None]:
-    """What earlier tests imported is not looked through at each collection of these tests."""
+def _rest_of_the_process() -> None:
+    """What earlier tests left is not looked through at each collection of these tests."""
     gc.collect()
-    gc.freeze()
-    yield
-    gc.unfreeze()
+    gc.freeze()  # as the whole run does once it has collected its tests, so it stays so
 
 
 @pytest.fixture

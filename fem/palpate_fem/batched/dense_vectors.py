@@ -57,14 +57,14 @@ _MULTIPLY_ROW = (
         #pragma unroll
         for (int k = four; k < 32; k += 16) {
             const stored* from = known + 64 * c;
-            const double2 first = make_double2(number(from, k), number(from, k + 1));
-            const double2 second = make_double2(number(from, k + 2), number(from, k + 3));
+            const double2 factor = make_double2(number(from, k), number(from, k + 1));
+            const double2 next = make_double2(number(from, k + 2), number(from, k + 3));
             #pragma unroll
             for (int m = 0; m < 4; m += 2) {
                 const stored* at = tile + 1024 * c + (8 * m + row) * 32 + k;
                 const Four upper = four_at(at), lower = four_at(at + 256);
-                add_product(sum[m], sum[m + 1], upper.first, lower.first, first);
-                add_product(sum[m], sum[m + 1], upper.second, lower.second, second);
+                add_product(sum[m], sum[m + 1], upper.first, lower.first, factor);
+                add_product(sum[m], sum[m + 1], upper.second, lower.second, next);
             }
         }
     finish(sum, [=](int m) { return 2 * (8 * m + row); });

@@ -194,7 +194,7 @@ class BatchedFactor:
             "levels": float(tiles.levels),
             "gflop": tiles.tree.flop / 1e9,
             "padded_gflop": tiles.gflop,
-            "mib_a_slot": (4.0 * stored * TILE**2 + 16.0 * tiles.rows * LANES) / 2**20,
+            "mib_a_slot": 4.0 * (stored * TILE**2 + 2 * tiles.rows * LANES) / 2**20,
         }
 
     def factorise(self, slots: wp.array) -> None:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from palpate_fem.batched import dense_tiles
+from palpate_fem.batched import dense_panels, dense_tiles
 from palpate_fem.batched.dense_tiles import THREADS, WIDE
 
 wp.set_module_options({"enable_backward": False})
@@ -106,7 +106,7 @@ def factorise_panels(
         first_tile = fronts[front, 4]
         panel = slot * panel_tiles + first_tile
         first_share = slot * share_tiles
-        dense_tiles.factorise_panel(
+        dense_panels.factorise_panel(
             children, rows_in_child, child, last_child, first_share, shares_in, sources_at,
             sources, first_tile, values_in, slot, panels, panel, own, rows, bad, thread,
         )  # fmt: skip
@@ -141,7 +141,7 @@ def begin_panels(
     c = tile % width
     if marked[slot, front] != 0 and c < own and c <= r and r < fronts[front, 1]:
         first_tile = fronts[front, 4]
-        dense_tiles.begin_tile(
+        dense_panels.begin_tile(
             children, rows_in_child, fronts[front, 2], fronts[front, 3], slot * share_tiles,
             shares_in, sources_at, sources, first_tile, values_in, slot,
             panels_in, slot * panel_tiles + first_tile, own, r, c,
@@ -171,7 +171,7 @@ def divide_columns(
     own = fronts[front, 0]
     if marked[slot, front] != 0 and column < own:
         panel = slot * panel_tiles + fronts[front, 4]
-        dense_tiles.divide_column(
+        dense_panels.divide_column(
             panels, panel, own, fronts[front, 1], column,
             unfinished_in, (number * slots.shape[0] + i) * room,
             part, parts, slot, bad, thread,
@@ -201,7 +201,7 @@ def subtract_columns(
     r = column + 1 + tile // left
     j = column + 1 + tile % left
     if marked[slot, front] != 0 and j < own and j <= r and r < fronts[front, 1]:
-        dense_tiles.subtract_column(
+        dense_panels.subtract_column(
             panels_in, slot * panel_tiles + fronts[front, 4], own, column, r, j,
             unfinished, (number * slots.shape[0] + i) * room, thread,
         )  # fmt: skip
@@ -260,7 +260,7 @@ def invert_triangles(
     corner = listed[number, 1]
     if marked[slot, front] != 0:
         own = fronts[front, 0]
-        dense_tiles.invert_triangle(
+        dense_panels.invert_triangle(
             panels, slot * panel_tiles + fronts[front, 4], own, corner,
             dense_tiles.end_of(corner, own), thread,
         )  # fmt: skip
