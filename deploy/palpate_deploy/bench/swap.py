@@ -247,12 +247,14 @@ class Judge:
 
     def __init__(self, witness: Witness, runtimes: Mapping[bytes, Runtime], book: TareBook) -> None:
         self._runtimes = runtimes
-        self._book = book
         self._frames = {
             (got.sensor, got.message.stamp.sequence): got.message
             for got in witness.frames
             if got.message.tare_id != NO_TARE
         }
+        # While the gateway answers: a tare may be older than this end of the stream.
+        named = {(sensor, frame.tare_id) for (sensor, _), frame in self._frames.items()}
+        self._tares = {name: book.baseline(*name, timeout_s=_START_S) for name in named}
         self._estimates: dict[tuple[str, int], list[ReceivedMessage[FeatureEstimate]]] = {}
         for got in witness.estimates:
             key = (got.sensor, got.message.source.sequence)
@@ -284,7 +286,7 @@ class Judge:
     ) -> bool:
         if runtime is None:
             return False
-        wanted = estimate(frame, self._book.find(sensor, frame.tare_id), runtime)
+        wanted = estimate(frame, self._tares[sensor, frame.tare_id], runtime)
         return not isinstance(wanted, EstimateRefusal) and payload == FEATURE_ESTIMATE.encode(
             wanted
         )
