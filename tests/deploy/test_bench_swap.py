@@ -14,29 +14,12 @@ from palpate.bus.tares import TareBook
 from palpate.codec import FEATURE_ESTIMATE
 from palpate.config import LinkConfig
 from palpate.files.bundle import read_bundle
-from palpate.messages import ElectrodeFrame, Origin, SensorType, Stamp, Tare
-from palpate_deploy.bench.harness import bench_counts
+from palpate.messages import Tare
+from palpate_deploy.bench.codec import bench_frame
 from palpate_deploy.bench.swap import Judge
 from palpate_services.inference.estimates import EstimateRefusal, estimate
 from palpate_services.inference.model import load
 from palpate_services.inference.repository import resolve
-
-
-def frame_of(counts: Any, sequence: int) -> ElectrodeFrame:
-    now_ns, wall_ns = clock.now()
-    return ElectrodeFrame(
-        stamp=Stamp(sequence, sequence, now_ns, wall_ns, clock.CLOCK_ID, Origin.SIMULATED),
-        sensor_serial="BT-TEST",
-        sensor_type=SensorType.BIOTAC,
-        electrodes=counts[:19],
-        pdc=int(counts[19]),
-        pac=counts[20:42],
-        tac=int(counts[42]),
-        tdc=int(counts[43]),
-        validity=(1 << 44) - 1,
-        slot_period_ns=227_273,
-        tare_id=7,
-    )
 
 
 def test_estimates_on_a_tare_from_before_the_bench_listened_are_judged(
@@ -45,11 +28,20 @@ def test_estimates_on_a_tare_from_before_the_bench_listened_are_judged(
     """The tare is asked for while the gateway is there; they are judged when it is not."""
     found = read_bundle(resolve(bundle))
     runtime = load(found, "features")
-    frames = [frame_of(counts, number + 1) for number, counts in enumerate(bench_counts()[:20])]
+    frames = [bench_frame(index) for index in range(20)]
     first = frames[0]
-    spread = np.full(19, 1.5, np.float32)
-    baseline = first.electrodes.astype(np.float32)
-    tare = Tare(7, first.stamp, "BT-TEST", baseline, spread, 1500.0, 2000.0, 2100.0, 1900.0, 100)
+    tare = Tare(
+        tare_id=first.tare_id,
+        stamp=first.stamp,
+        sensor_serial=first.sensor_serial,
+        electrodes=first.electrodes.astype(np.float32),
+        electrodes_sd=np.full(19, 1.5, np.float32),
+        pdc=float(first.pdc),
+        pac=float(first.pac.mean()),
+        tac=float(first.tac),
+        tdc=float(first.tdc),
+        frames_averaged=100,
+    )
     right, others = [estimate(frame, tare, runtime) for frame in frames], frames[1:] + frames[:1]
     seen, given = [], []
     for frame, other, answer in zip(frames, others, right, strict=True):

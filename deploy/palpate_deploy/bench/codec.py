@@ -18,7 +18,7 @@ GOAL_S = 25e-6
 
 def run_codec(rounds: int, *, as_json: bool, save: bool) -> None:
     """``palpate bench codec``, whose help explains the options: measure, print, keep."""
-    frames = [_frame(index) for index in range(KINDS)]
+    frames = [bench_frame(index) for index in range(KINDS)]
     payloads = [ELECTRODE_FRAME.encode(frame) for frame in frames]
     both = _median_s(lambda i: ELECTRODE_FRAME.decode(ELECTRODE_FRAME.encode(frames[i])), rounds)
     encode = _median_s(lambda i: ELECTRODE_FRAME.encode(frames[i]), rounds)
@@ -52,7 +52,8 @@ def _median_s(call: Callable[[int], Any], rounds: int) -> float:
     return max(0.0, statistics.median(times) - statistics.median(empty)) * 1e-9
 
 
-def _frame(index: int) -> ElectrodeFrame:
+def bench_frame(index: int) -> ElectrodeFrame:
+    """A frame of the benchmark's finger, just read; ``index`` is below `KINDS`."""
     counts = bench_counts()[index]
     now_ns = time.monotonic_ns()
     return ElectrodeFrame(
