@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import threading
 import time
@@ -204,9 +205,10 @@ def test_no_frame_is_lost_and_no_estimate_mixed_while_bundles_change(
     admin: Admin,
     make_frame: Frames,
     make_tare: Callable[..., Tare],
+    until: Until,
 ) -> None:
     """Every frame gets exactly the estimate that one of the two bundles makes of it."""
-    tare, frames = make_tare(), [make_frame(n) for n in range(1, 401)]
+    tare = make_tare()
     runtimes = {
         found.sha256: load(found, "features")
         for found in (read_bundle(kept.repository_folder / "x" / version) for version in "12")
@@ -217,24 +219,34 @@ def test_no_frame_is_lost_and_no_estimate_mixed_while_bundles_change(
         estimates = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
         sender = session.publisher(ELECTRODES, sensor="finger", lossless=True)
         operator, done = admin(session), threading.Event()
+        served: Counter[bytes] = Counter()
+        first, second = runtimes
+
+        def wait_for_a_frame_of(bundle: bytes) -> None:
+            before = served[bundle]
+            until(lambda: served[bundle] > before)
 
         def change() -> None:
-            for _ in range(4):
-                operator.load("features", "x:2")
-                operator.roll_back("features")
-            done.set()
+            try:
+                for _ in range(4):
+                    operator.load("features", "x:2")
+                    wait_for_a_frame_of(second)
+                    operator.roll_back("features")
+                    wait_for_a_frame_of(first)
+            finally:
+                done.set()
 
         changing = threading.Thread(target=change)
         changing.start()
-        served: Counter[bytes] = Counter()
-        for frame in frames:
+        for number in itertools.count(1):  # however long the changes take
+            frame = make_frame(number)
             sender.put(frame)
             got = estimates.next(20.0)
             served[got.message.bundle_sha256] += 1
             wanted = estimate(frame, tare, runtimes[got.message.bundle_sha256])
             assert got.payload == codec.FEATURE_ESTIMATE.encode(wanted)  # type: ignore[arg-type]
-            if not done.is_set():
-                time.sleep(0.005)
+            if done.is_set():
+                break
+            time.sleep(0.005)
         changing.join(60)
-        assert done.is_set()
-        assert set(served) == set(runtimes), "both served while frames came"
+        assert min(served[first], served[second]) >= 4, "both served while frames came"
