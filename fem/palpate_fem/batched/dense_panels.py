@@ -189,10 +189,18 @@ _FACTORISE = (
 """
 )
 
+_UNFINISHED = """
+    // Tile (r, c) of a panel before its column is divided.
+    auto unfinished_at = [=](int r, int c) {
+        return unfinished.data + (size_t(first_unfinished) + above(r) + c) * 1024;
+    };
+"""
+
 _BEGIN_TILE = (
     _PANEL
+    + _UNFINISHED
     + """
-    double* target = unfinished.data + (size_t(first_unfinished) + above(r) + c) * 1024;
+    double* target = unfinished_at(r, c);
 #ifdef PALPATE_TENSOR_CORES
     begin(target, r, c, thread / 32, 0);
 #else
@@ -205,31 +213,30 @@ _BEGIN_TILE = (
 _DIVIDE_COLUMN = (
     PRODUCTS
     + FRONT
+    + _UNFINISHED
     + _DIVIDE
     + """
-    auto from_of = [=](int r) {
-        return unfinished.data + (size_t(first_unfinished) + above(r) + c) * 1024;
-    };
     stored* to = tiles_of(c) + 1024 * c;
 #ifdef PALPATE_TENSOR_CORES
     __shared__ __align__(16) stored inverse[1024];
     stored mine[each];
-    const bool good = invert(mine, from_of(c));
+    const bool good = invert(mine, unfinished_at(c, c));
     put(inverse, mine, good);
     if (part == 0)
         put(to, mine, good);
     __syncthreads();
     for (int half = 2 * c + 2 + part * warps + warp; half < 2 * rows; half += parts * warps)
-        multiply(tiles_of(half / 2) + 1024 * c, from_of(half / 2), inverse, half % 2);
+        multiply(
+            tiles_of(half / 2) + 1024 * c, unfinished_at(half / 2, c), inverse, half % 2);
     if (part == 0 && thread == 0 && !good)
         bad.data[slot] = 1;
 #else
     if (part > 0 || thread > 0)
         return;
-    if (!invert(to, from_of(c)))
+    if (!invert(to, unfinished_at(c, c)))
         bad.data[slot] = 1;
     for (int r = c + 1; r < rows; ++r)
-        multiply(tiles_of(r) + 1024 * c, from_of(r), to);
+        multiply(tiles_of(r) + 1024 * c, unfinished_at(r, c), to);
 #endif
 """
 )
@@ -318,8 +325,9 @@ _INVERT_TRIANGLE = (
 _SUBTRACT_COLUMN = (
     PRODUCTS
     + FRONT
+    + _UNFINISHED
     + """
-    double* tile = unfinished.data + (size_t(first_unfinished) + above(r) + j) * 1024;
+    double* tile = unfinished_at(r, j);
     const stored* a = tiles_of(r) + 1024 * c;
     const stored* b = tiles_of(j) + 1024 * c;
 #ifdef PALPATE_TENSOR_CORES

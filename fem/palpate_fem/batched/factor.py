@@ -1,9 +1,9 @@
 """Cholesky factors of many matrices of one pattern at once: multifrontal, in tiles, on a GPU.
 
 The elimination tree is that of the CPU's solver (``ordering``). Its fronts are worked on level by
-level, leaves first, for all listed matrices together. Factors are kept in single precision, sums
-are added up in double, and there is no pivoting: a matrix that is not positive definite is reported
-(ADR 0026).
+level, leaves first, for all listed matrices together. Factors, and the
+vectors of a solve, are kept in single precision; sums are added up in double. There is no pivoting:
+a matrix that is not positive definite is reported (ADR 0026).
 
 A front whose entries, and whose children, are what they were at the last factorisation is left as
 it is. Where only contact has changed, that is most of them.
@@ -167,7 +167,7 @@ class BatchedFactor:
         self._shares = wp.zeros(
             (slots * tiles.share_tiles, *square), dtype=wp.float32, device=device
         )
-        # Of fronts that are factorised by columns, before a column is divided.
+        # Tiles of fronts that are factorised by columns, until their column is divided.
         wide = [tiles.panels[tiles.level == level] for level in self._wide]
         self._room = int(max((panels.max() for panels in wide), default=0))
         fronts = min(self.few, slots * max((len(panels) for panels in wide), default=0))
