@@ -57,7 +57,7 @@ def measure(pattern: Any, slots: int, device: str) -> dict[str, Any]:
     indptr, indices = np.asarray(pattern.indptr), np.asarray(pattern.indices)
     factor = BatchedFactor(indptr, indices, pattern.free // 3, slots=slots, device=device)
     values = dominant(indptr, indices)
-    one = wp.array(values, dtype=wp.float64, device=device)
+    one = wp.array(values, dtype=factor.values.dtype, device=device)
     nothing = wp.zeros_like(one)
     every = wp.array(np.arange(slots, dtype=np.int32), dtype=wp.int32, device=device)
     random = np.random.default_rng(1).normal(size=(slots, 2, len(indptr) - 1))

@@ -17,7 +17,7 @@ _PANEL = (
     + FRONT
     + """
     // Which of the matrix's entries stand in a tile, if any do: -1 = none, -2 = a one.
-    const double* known = &wp::index(values, slot, 0);
+    const stored* known = &wp::index(values, slot, 0);
     auto sources_of = [=](int r, int c) {
         const int at = sources_at.data[first_tile + above(r) + c];
         return at < 0 ? nullptr : sources.data + size_t(at) * 1024;
@@ -362,7 +362,7 @@ def factorise_panel(
     sources_at: wp.array(dtype=wp.int32),
     sources: wp.array(dtype=wp.int32),
     first_tile: int,
-    values: wp.array2d(dtype=wp.float64),
+    values: wp.array2d(dtype=wp.float32),
     slot: int,
     panels: wp.array3d(dtype=wp.float32),
     panel: int,
@@ -393,7 +393,7 @@ def begin_tile(
     sources_at: wp.array(dtype=wp.int32),
     sources: wp.array(dtype=wp.int32),
     first_tile: int,
-    values: wp.array2d(dtype=wp.float64),
+    values: wp.array2d(dtype=wp.float32),
     slot: int,
     panels: wp.array3d(dtype=wp.float32),
     panel: int,

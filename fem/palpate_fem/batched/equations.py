@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from palpate_fem.arrays import Floats, Ints
-from palpate_fem.batched import kernels, mortar_kernels
+from palpate_fem.batched import kernels, mortar_kernels, reductions
 from palpate_fem.batched.launches import Launches, Sequences
 from palpate_fem.batched.state import (
     BatchedState,
@@ -63,6 +63,7 @@ class BatchedEquations:
         """
         self.system, self.slots, self.device = system, slots, device
         self._lists: dict[bytes, Listed] = {}
+        self._flattened: dict[int, wp.array] = {}
         self._launch, self._sequences = Launches(device), Sequences(device)
         mesh, pattern, skin = system.mesh, system.pattern, system.skin
         self._law, self._core_law = system.contact.law(friction), system.contact.law(0.0)
@@ -78,6 +79,9 @@ class BatchedEquations:
 
         self._elements, self._pairs = ints(mesh.elements), ints(pattern.element_pairs)
         self._gradient = on_device(skin.gradient_values, wp.vec3d, device)
+        # The same, where neighbouring threads have neighbouring quadrature points.
+        by_corner = np.swapaxes(skin.gradient_values, 1, 2)
+        self._gradient_at_points = on_device(by_corner, wp.vec3d, device).transpose((0, 2, 1))
         self._weight, self._rest_volume = numbers(skin.weight_values), numbers(skin.rest_volume)
         self._bulk = numbers(skin.bulk_over_volume)
         self._free, self._gather = ints(pattern.free), ints(pattern.gather)
@@ -99,10 +103,10 @@ class BatchedEquations:
         self._volume_gradient = room(wp.vec3d, total, corners)
         self._frozen_gradient = room(wp.vec3d, total, corners)
         self._target = room(wp.float64, total)
-        # Of quadrature points: J, w P and w J F^-T; F, F^-T and scales, of which tangents are made.
-        self._stresses = [room(kind, total, points) for kind in (wp.float64, wp.mat33d, wp.mat33d)]
-        made_of = wp.mat33d, wp.mat33d, element_kernels.Scales
-        self._deformations = [room(kind, total, points) for kind in made_of]
+        # Of quadrature points: F, F^-T and scales, of which tangents are made.
+        matrices = [room(wp.float64, 9, total * points) for _ in range(2)]
+        self._deformations = [*matrices, room(element_kernels.Scales, total, points)]
+        self._by_point = wp.get_device(device).is_cuda and corners == points == 8
         self._elastic = room(wp.mat33d, slots * pattern.blocks)
         self._sum = room(wp.mat33d, slots * pattern.blocks)
         self._internal, self._gradient_of_volume, self._unbalanced = (
@@ -127,8 +131,8 @@ class BatchedEquations:
             ]  # fmt: skip
             self._core_margin = wp.float64(system.contact.margin_m + 2 * core.spacing)
         self._margin = wp.float64(system.contact.margin_m)
-        self._numbers = room(wp.float64, slots, kernels.NUMBERS)
-        self._longest = room(wp.float64, slots)
+        self._numbers = room(wp.float64, slots, reductions.NUMBERS)
+        self._longest = room(wp.float64, slots, 1)
 
     def _kinds(self, indenters: Sequence[Indenter]) -> None:
         """Rows of all indenters, and from which gap on each holds directions."""
@@ -234,21 +238,20 @@ class BatchedEquations:
     def _skin_forces(self, state: BatchedState, listed: Listed) -> None:
         """Evaluate the forces of the skin, and the cavity's volume."""
         for field in (self._internal, self._gradient_of_volume):
-            self._clear(listed, field)
-        inner, corners, points = self.inner, self._elements.shape[1], self._weight.shape[1]
-        self._launch(
-            element_kernels.point_stress,
-            (len(listed.elements), points),
-            [*self._model, listed.elements, state.position, state.pressure],
-            self._stresses,
-        )
-        self._launch(
-            element_kernels.corner_forces,
-            (len(listed.elements), corners),
-            [self._elements, self._gradient, self._weight, self._nodes, listed.elements,
-             *self._stresses],
-            [self._volume, self._jacobian, self._volume_gradient, self._internal],
-        )  # fmt: skip
+            self._clear(listed, 3 * self._nodes, field)
+        inner = self.inner
+        results = [self._volume, self._jacobian, self._volume_gradient, self._internal]
+        place = [listed.elements, state.position, state.pressure]
+        count = len(listed.elements)
+        if self._by_point:
+            self._launch(
+                element_kernels.element_state_by_point,
+                (count, 8),
+                [*self._at_points, *place],
+                results,
+            )
+        else:
+            self._launch(element_kernels.element_state, count, [*self._model, *place], results)
         self._launch(
             element_kernels.cavity_volume,
             len(listed.inner),
@@ -260,7 +263,7 @@ class BatchedEquations:
         """Evaluate the forces of indenter and core."""
         outer, inner = self.outer, self.inner
         for field in (outer.force, inner.force):
-            self._clear(listed, field)
+            self._clear(listed, 3 * self._nodes, field)
         posed = [self._primitives, self._kind]
         place = [self._tip, self._rotation, self._nodes, listed.outer]
         self._launch(
@@ -300,64 +303,61 @@ class BatchedEquations:
 
     def _reduce(self, state: BatchedState, listed: Listed) -> None:
         """Sums and maxima of the listed slots."""
-        slots, outer, inner = listed.slots, self.outer, self.inner
-        count = len(slots)
-        self._launch(kernels.clear_numbers, (count, kernels.NUMBERS), [slots], [self._numbers])
-        self._launch(
-            kernels.sum_nodes,
-            (count, self._nodes),
-            [slots, self._held, self._nodes, self._internal, outer.force, inner.force,
+        outer, inner = self.outer, self.inner
+
+        def reduce(kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+            dim = (len(listed.slots), reductions.padded(count))
+            self._launch(kernel, dim, [listed.slots, *inputs], [*outputs, self._numbers])
+
+        dim = (len(listed.slots), reductions.NUMBERS)
+        self._launch(reductions.clear_numbers, dim, [listed.slots], [self._numbers])
+        reduce(
+            reductions.sum_nodes,
+            self._nodes,
+            [self._held, self._nodes, self._internal, outer.force, inner.force,
              self._gradient_of_volume, state.fluid_pressure],
-            [self._unbalanced, self._numbers],
+            [self._unbalanced],
         )  # fmt: skip
-        self._launch(
-            kernels.sum_elements,
-            (count, self._elements_each),
-            [slots, self._elements_each, self._rest_volume, self._bulk, self._volume,
-             self._jacobian, state.pressure],
-            [self._numbers],
+        reduce(
+            reductions.sum_elements,
+            self._elements_each,
+            [self._elements_each, self._rest_volume, self._bulk, self._volume, self._jacobian,
+             state.pressure],
+            [],
         )  # fmt: skip
-        self._launch(
-            kernels.sum_cavity,
-            (count, inner.count),
-            [slots, inner.count, self._face_volume],
-            [self._numbers],
-        )
-        for surface, items, pressure in (
-            (outer, listed.outer, state.indenter_pressure),
-            (inner, listed.inner, state.core_pressure),
-        ):
+        reduce(reductions.sum_cavity, inner.count, [inner.count, self._face_volume], [])
+        for surface, pressure in ((outer, state.indenter_pressure), (inner, state.core_pressure)):
             traction = state.traction if surface is outer else surface.wanted_traction
-            self._launch(
-                kernels.sum_contact,
-                len(items),
-                [items, surface.count, surface.wanted, pressure, surface.wanted_traction,
-                 traction, surface.status, surface.frozen_status],
-                [self._numbers],
+            reduce(
+                reductions.compare_contact,
+                surface.count,
+                [surface.count, surface.wanted, pressure, surface.wanted_traction, traction,
+                 surface.status, surface.frozen_status],
+                [],
             )  # fmt: skip
 
     def numbers(self, state: BatchedState, listed: Listed) -> list[SlotNumbers]:
         """Numbers of the last `balance`, read back, for each listed slot."""
         rows = self._numbers.numpy()[listed.numbers]
         fluid = state.fluid_pressure.numpy()[listed.numbers].tolist()
-        sizes = rows[:, [kernels.FLUID, kernels.INDENTER, kernels.CORE, kernels.INTERNAL]]
+        sizes = rows[:, reductions.INTERNAL : reductions.CORE + 1]
         scale = np.maximum(np.sqrt(sizes).sum(axis=1), FORCE_FLOOR_N)
-        residual = (np.sqrt(rows[:, kernels.UNBALANCED]) / scale).tolist()
-        largest = np.maximum(rows[:, kernels.LARGEST], TRACTION_FLOOR_PA)
-        traction = (rows[:, kernels.TRACTION] / largest).tolist()
-        gap = (rows[:, kernels.GAP] / self.system.contact.stiffness).tolist()
-        forces = -rows[:, kernels.NET : kernels.NET + 3]
+        residual = (np.sqrt(rows[:, reductions.UNBALANCED]) / scale).tolist()
+        largest = np.maximum(rows[:, reductions.LARGEST], TRACTION_FLOOR_PA)
+        traction = (rows[:, reductions.TRACTION] / largest).tolist()
+        gap = (rows[:, reductions.GAP] / self.system.contact.stiffness).tolist()
+        forces = -rows[:, reductions.NET : reductions.NET + 3]
         return [
             SlotNumbers(
                 residual=residual[k],
-                volume=row[kernels.VOLUME],
-                strain_error=row[kernels.STRAIN],
+                volume=row[reductions.VOLUME],
+                strain_error=row[reductions.STRAIN],
                 gap_error_m=gap[k],
                 traction_error=traction[k],
-                smallest_jacobian=row[kernels.JACOBIAN],
+                smallest_jacobian=row[reductions.JACOBIAN],
                 net_force=forces[k],
                 fluid_pressure=fluid[k],
-                sets_changed=bool(row[kernels.CHANGED]),
+                sets_changed=bool(row[reductions.CHANGED]),
             )
             for k, row in enumerate(rows.tolist())
         ]
@@ -392,16 +392,11 @@ class BatchedEquations:
         inner = self.inner
         if elastic is not None:
             corners = self._volume_gradient.shape[1]
-            self._launch(
-                kernels.clear_matrices,
-                (len(elastic.slots), self._blocks_each),
-                [elastic.slots, self._blocks_each],
-                [self._elastic],
-            )
+            self._clear(elastic, 9 * self._blocks_each, self._elastic)
             self._launch(
                 element_kernels.point_deformation,
                 (len(elastic.elements), self._weight.shape[1]),
-                [*self._model, elastic.elements, state.position, state.pressure],
+                [*self._at_points, elastic.elements, state.position, state.pressure],
                 self._deformations,
             )
             self._launch(
@@ -430,8 +425,8 @@ class BatchedEquations:
         count = len(listed.slots)
         self._launch(
             kernels.gather_values,
-            (count, len(self._gather)),
-            [listed.slots, self._gather, self._blocks_each, flat(self._sum)],
+            (count, kernels.threads_for(len(self._gather))),
+            [listed.slots, self._gather, self._blocks_each, self._flat(self._sum)],
             [values],
         )
         self._launch(
@@ -476,7 +471,7 @@ class BatchedEquations:
         """Subtract `EquilibriumSystem.unsymmetric_product` of a change of the free unknowns."""
         moved = self._as_field(listed, change, of)
         field, outer = self._product, self.outer
-        self._clear(listed, field)
+        self._clear(listed, 3 * self._nodes, field)
         self._launch(
             contact_kernels.unsymmetric_product,
             len(listed.outer),
@@ -494,14 +489,9 @@ class BatchedEquations:
         How the offsets change is kept for `targets`.
         """
         moved, field = self._as_field(listed, change, of), self._product
-        self._clear(listed, field)
+        self._clear(listed, 3 * self._nodes, field)
         for surface, items in self._mortar_surfaces(listed):
-            self._launch(
-                kernels.clear_numbers,
-                (len(listed.slots), self._nodes),
-                [listed.slots],
-                [surface.offset_change],
-            )
+            self._clear(listed, self._nodes, surface.offset_change)
             surface.add_offset_changes(items, self._margin, moved)
             surface.add_offset_load(items, field)
         self._gather_load(listed, -1.0, field, vectors, lane, add=True)
@@ -525,15 +515,15 @@ class BatchedEquations:
     def longest_move(self, listed: Listed, change: wp.array, lane: int) -> Floats:
         """Longest move of a node of each listed slot [m], (m,); infinite if one is no number."""
         self._sequences(listed.slots, self._find_longest, listed, change, lane)
-        square = self._longest.numpy()[listed.numbers]
+        square = self._longest.numpy()[listed.numbers, 0]
         return np.asarray(np.where(square < 1e299, np.sqrt(square), np.inf))
 
     def _find_longest(self, listed: Listed, change: wp.array, lane: int) -> None:
         moved = self._as_field(listed, change, lane)
         self._longest.zero_()
         self._launch(
-            kernels.longest_moves,
-            (len(listed.slots), self._nodes),
+            reductions.longest_moves,
+            (len(listed.slots), reductions.padded(self._nodes)),
             [listed.slots, self._nodes, moved],
             [self._longest],
         )
@@ -630,15 +620,27 @@ class BatchedEquations:
         return [self._elements, self._gradient, self._weight, *constants, self._nodes]
 
     @property
+    def _at_points(self) -> list[Any]:
+        elements, _, *others = self._model
+        return [elements, self._gradient_at_points, *others]
+
+    @property
     def _condensed(self) -> list[Any]:
         return [self._elements, self._rest_volume, self._bulk, self._nodes]
 
-    def _clear(self, listed: Listed, field: wp.array) -> None:
-        dim = (len(listed.slots), self._nodes)
-        self._launch(kernels.clear_vectors, dim, [listed.slots, self._nodes], [field])
+    def _flat(self, array: wp.array) -> wp.array:
+        """`flat`, kept for each array."""
+        if array.ptr not in self._flattened:
+            self._flattened[array.ptr] = array.flatten() if array.dtype is wp.int32 else flat(array)
+        return self._flattened[array.ptr]
+
+    def _clear(self, listed: Listed, each: int, array: wp.array) -> None:
+        """Set ``each`` numbers of every listed slot to zero."""
+        dim = (len(listed.slots), kernels.threads_for(each))
+        self._launch(kernels.clear_rows, dim, [listed.slots, each], [self._flat(array)])
 
     def _cleared_field(self, listed: Listed) -> wp.array:
-        self._clear(listed, self._field)
+        self._clear(listed, 3 * self._nodes, self._field)
         return self._field
 
     def _as_field(self, listed: Listed, vectors: wp.array, lane: int) -> wp.array:
@@ -668,7 +670,7 @@ class BatchedEquations:
         integers = source.dtype is wp.int32
         self._launch(
             kernels.copy_integers if integers else kernels.copy_rows,
-            (len(listed.slots), each),
-            [listed.slots, each, source.flatten() if integers else flat(source)],
-            [copy.flatten() if integers else flat(copy)],
+            (len(listed.slots), kernels.threads_for(each)),
+            [listed.slots, each, self._flat(source)],
+            [self._flat(copy)],
         )

@@ -1,9 +1,9 @@
 """Cholesky factors of many matrices of one pattern at once: multifrontal, in tiles, on a GPU.
 
 The elimination tree is that of the CPU's solver (``ordering``). Its fronts are worked on level by
-level, leaves first, for all listed matrices together. Factors, and the
-vectors of a solve, are kept in single precision; sums are added up in double. There is no pivoting:
-a matrix that is not positive definite is reported (ADR 0026).
+level, leaves first, for all listed matrices together. Matrices, factors, and the vectors of a solve are
+kept in single precision; sums are added up in double. There is no pivoting: a matrix that is not
+positive definite is reported (ADR 0026).
 
 A front whose entries, and whose children, are what they were at the last factorisation is left as
 it is. Where only contact has changed, that is most of them.
@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from palpate_fem.batched import factor_kernels as kernels
 from palpate_fem.batched import solve_kernels
 from palpate_fem.batched.dense_tiles import INVERTED, LANES, THREADS, TILE, WIDE
-from palpate_fem.batched.dense_vectors import PARTS
+from palpate_fem.batched.dense_vectors import PARTS, SMALL
+from palpate_fem.batched.kernels import threads_for
 from palpate_fem.batched.launches import Launches, Sequences
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
 
@@ -145,9 +146,9 @@ class BatchedFactor:
             plan_elimination(np.asarray(indptr), np.asarray(indices), np.asarray(groups))
         )
         self.tiles, self.slots, self.size, self._device = tiles, slots, len(indptr) - 1, device
-        self.values = wp.zeros((slots, len(indices)), dtype=wp.float64, device=device)
+        self.values = wp.zeros((slots, len(indices)), dtype=wp.float32, device=device)
         # No number is what it was before the first factorisation.
-        self._known = wp.full((slots, len(indices)), np.nan, dtype=wp.float64, device=device)
+        self._known = wp.full((slots, len(indices)), np.nan, dtype=wp.float32, device=device)
         self._launch = Launches(device)
         self._sequences = Sequences(device)
         self._processors = wp.get_device(device).sm_count if self.values.device.is_cuda else 0
@@ -158,6 +159,9 @@ class BatchedFactor:
             for level in range(tiles.levels)
         ]
         self._wide = [k for k, (own, _) in enumerate(self._largest) if own >= columns]
+        self._small = [
+            k for k, (own, rows) in enumerate(self._largest) if own <= INVERTED and rows <= SMALL
+        ]
         self.bad = wp.zeros(slots, dtype=wp.int32, device=device)
         self.marked = wp.zeros((slots, len(tiles.fronts)), dtype=wp.int32, device=device)
         square = (TILE, TILE)
@@ -275,10 +279,9 @@ class BatchedFactor:
         self._launch(
             kernels.begin_marks, (count, len(tiles.fronts)), [slots, self.bad], [self.marked]
         )
-        entries = self.values.shape[1]
         self._launch(
             kernels.mark_changed,
-            (count, -(-entries // kernels.ENTRIES)),
+            (count, threads_for(self.values.shape[1])),
             [slots, self._entry_front, self._parent, self.values],
             [self._known, self.marked, self.bad],
         )
@@ -298,6 +301,12 @@ class BatchedFactor:
         self._loaded.zero_()
         plan = [self._row_links, self._children, self._rows_in_child]
         for level in range(tiles.levels):
+            if level in self._small:
+                self._over_small_fronts(
+                    solve_kernels.solve_small_fronts, level, slots, plan,
+                    [lanes, vectors, self._panels], [self._begun, self._half],
+                )  # fmt: skip
+                continue
             self._over_fronts(
                 solve_kernels.gather_loads, level, slots, plan, [lanes, vectors],
                 [self._begun, self._loaded],
@@ -313,6 +322,12 @@ class BatchedFactor:
                         *between,
                     )  # fmt: skip
         for level in reversed(range(tiles.levels)):
+            if level in self._small:
+                self._over_small_fronts(
+                    solve_kernels.answer_small_fronts, level, slots, [self._row_links],
+                    [self._panels, self._half], [self._begun],
+                )  # fmt: skip
+                continue
             self._over_fronts(
                 solve_kernels.gather_answers, level, slots, [self._row_links], [], [self._begun]
             )
@@ -349,6 +364,25 @@ class BatchedFactor:
             [slots, self._by_level, self._fronts, *plan, first, self.tiles.rows, *known],
             out,
         )
+
+    def _over_small_fronts(
+        self,
+        kernel: wp.Kernel,
+        level: int,
+        slots: wp.array,
+        plan: list[Any],
+        known: list[Any],
+        out: list[Any],
+    ) -> None:
+        """Launch a kernel with a block of threads for each front of a level."""
+        first, last = self._front_begins[level : level + 2]
+        self._launch(
+            kernel,
+            (last - first, len(slots), THREADS),
+            [slots, self._by_level, self._fronts, *plan, first, self.tiles.rows,
+             self.tiles.panel_tiles, *known],
+            out,
+        )  # fmt: skip
 
     def _over_tiles(
         self,

@@ -18,12 +18,9 @@ import warp as wp
 
 from palpate_fem.batched import dense_panels, dense_tiles
 from palpate_fem.batched.dense_tiles import THREADS, WIDE
+from palpate_fem.batched.kernels import ENTRIES
 
 wp.set_module_options({"enable_backward": False})
-
-ENTRIES = 4
-"""Entries of a matrix that a thread compares."""
-
 
 @wp.func
 def lower_tile(row: int, column: int):
@@ -47,8 +44,8 @@ def mark_changed(
     slots: wp.array(dtype=wp.int32),
     front_of: wp.array(dtype=wp.int32),
     parent: wp.array(dtype=wp.int32),
-    values_in: wp.array2d(dtype=wp.float64),
-    known: wp.array2d(dtype=wp.float64),
+    values_in: wp.array2d(dtype=wp.float32),
+    known: wp.array2d(dtype=wp.float32),
     marked: wp.array2d(dtype=wp.int32),
     bad_out: wp.array(dtype=wp.int32),
 ):
@@ -62,8 +59,7 @@ def mark_changed(
     if thread == 0:
         bad_out[slot] = 0
     entries = values_in.shape[1]
-    threads = (entries + wp.static(ENTRIES) - 1) // wp.static(ENTRIES)
-    for k in range(thread, entries, threads):
+    for k in range(thread, entries, (entries + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
         value = values_in[slot, k]
         if value != known[slot, k]:
             known[slot, k] = value
@@ -86,7 +82,7 @@ def factorise_panels(
     first: int,
     panel_tiles: int,
     share_tiles: int,
-    values_in: wp.array2d(dtype=wp.float64),
+    values_in: wp.array2d(dtype=wp.float32),
     shares_in: wp.array3d(dtype=wp.float32),
     panels: wp.array3d(dtype=wp.float32),
     bad: wp.array(dtype=wp.int32),
@@ -126,7 +122,7 @@ def begin_panels(
     width: int,
     panel_tiles: int,
     share_tiles: int,
-    values_in: wp.array2d(dtype=wp.float64),
+    values_in: wp.array2d(dtype=wp.float32),
     shares_in: wp.array3d(dtype=wp.float32),
     panels_in: wp.array3d(dtype=wp.float32),
     room: int,

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels for many copies of one fingertip: lists, moves, reductions, and sums over vectors.
+"""Kernels for many copies of one fingertip: lists, moves, and products of vectors.
 
 Arrays of the copies follow one another: node k of slot s is at ``s * nodes + k``, and so on.
 Vectors of the free unknowns have the shape (slots, lanes, n). The equations' own kernels
@@ -8,20 +8,23 @@ Vectors of the free unknowns have the shape (slots, lanes, n). The equations' ow
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 STRETCH = 512
 """Entries of a vector that one block of threads adds up."""
 
+ENTRIES = 4
+"""Entries that a thread clears, copies or compares, where it does nothing else."""
+
+
+def threads_for(count: int) -> int:
+    """Threads that clear or copy so many entries of a slot."""
+    return -(-count // ENTRIES)
+
+
 wp.set_module_options({"enable_backward": False})
-
-NUMBERS = 16
-"""Numbers of a slot that the host looks at; places below."""
-
-UNBALANCED, INTERNAL, FLUID, INDENTER, CORE = 0, 1, 2, 3, 4  # sums of squares
-VOLUME, STRAIN, GAP, TRACTION, LARGEST, JACOBIAN, CHANGED = 5, 6, 7, 8, 9, 10, 11
-NET = 12  # and 13, 14
-
 
 @wp.kernel
 def expand(slots: wp.array(dtype=wp.int32), count: int, items_out: wp.array(dtype=wp.int32)):
@@ -38,21 +41,14 @@ def expand_across(slots: wp.array(dtype=wp.int32), count: int, items_out: wp.arr
 
 
 @wp.kernel
-def clear_vectors(
-    slots: wp.array(dtype=wp.int32), count: int, vectors_out: wp.array(dtype=wp.vec3d)
+def clear_rows(
+    slots: wp.array(dtype=wp.int32), count: int, numbers_out: wp.array(dtype=wp.float64)
 ):
-    """Set ``count`` vectors of each listed slot to zero."""
-    i, k = wp.tid()
-    vectors_out[slots[i] * count + k] = wp.vec3d()
-
-
-@wp.kernel
-def clear_matrices(
-    slots: wp.array(dtype=wp.int32), count: int, matrices_out: wp.array(dtype=wp.mat33d)
-):
-    """Set ``count`` matrices of each listed slot to zero."""
-    i, k = wp.tid()
-    matrices_out[slots[i] * count + k] = wp.mat33d()
+    """Set ``count`` numbers of each listed slot to zero; for `threads_for` them."""
+    i, thread = wp.tid()
+    begin = slots[i] * count
+    for k in range(thread, count, (count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
+        numbers_out[begin + k] = wp.float64(0.0)
 
 
 @wp.kernel
@@ -62,10 +58,11 @@ def copy_rows(
     source_in: wp.array(dtype=wp.float64),
     copy_out: wp.array(dtype=wp.float64),
 ):
-    """Copy ``count`` numbers of each listed slot."""
-    i, k = wp.tid()
-    at = slots[i] * count + k
-    copy_out[at] = source_in[at]
+    """Copy ``count`` numbers of each listed slot; for `threads_for` them."""
+    i, thread = wp.tid()
+    begin = slots[i] * count
+    for k in range(thread, count, (count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
+        copy_out[begin + k] = source_in[begin + k]
 
 
 @wp.kernel
@@ -76,9 +73,10 @@ def copy_integers(
     copy_out: wp.array(dtype=wp.int32),
 ):
     """`copy_rows` of integers."""
-    i, k = wp.tid()
-    at = slots[i] * count + k
-    copy_out[at] = source_in[at]
+    i, thread = wp.tid()
+    begin = slots[i] * count
+    for k in range(thread, count, (count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
+        copy_out[begin + k] = source_in[begin + k]
 
 
 @wp.kernel
@@ -91,16 +89,17 @@ def extrapolate(
     before_in: wp.array(dtype=wp.float64),
     trial_out: wp.array(dtype=wp.float64),
 ):
-    """Now + ratio (now - before); not below zero where ``positive``."""
-    i, k = wp.tid()
+    """Now + ratio (now - before); not below zero where ``positive``. For `threads_for` them."""
+    i, thread = wp.tid()
     slot = slots[i]
-    at = slot * count + k
-    value = now_in[at]
-    if ratio[slot] != wp.float64(0.0):
-        value += ratio[slot] * (value - before_in[at])
-    if positive != 0:
-        value = wp.max(value, wp.float64(0.0))
-    trial_out[at] = value
+    for k in range(thread, count, (count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
+        at = slot * count + k
+        value = now_in[at]
+        if ratio[slot] != wp.float64(0.0):
+            value += ratio[slot] * (value - before_in[at])
+        if positive != 0:
+            value = wp.max(value, wp.float64(0.0))
+        trial_out[at] = value
 
 
 @wp.kernel
@@ -236,12 +235,15 @@ def gather_values(
     gather: wp.array(dtype=wp.int32),
     blocks: int,
     sum_in: wp.array(dtype=wp.float64),
-    values_out: wp.array2d(dtype=wp.float64),
+    values_out: wp.array2d(dtype=Any),
 ):
-    """Entries of the upper triangle from the node-pair blocks."""
-    i, k = wp.tid()
+    """Entries of the upper triangle from the node-pair blocks; for `threads_for` them."""
+    i, thread = wp.tid()
     slot = slots[i]
-    values_out[slot, k] = sum_in[slot * blocks * 9 + gather[k]]
+    begin = slot * blocks * 9
+    count = gather.shape[0]
+    for k in range(thread, count, (count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
+        values_out[slot, k] = values_out.dtype(sum_in[begin + gather[k]])
 
 
 @wp.kernel
@@ -250,152 +252,12 @@ def add_viscosity(
     starts: wp.array(dtype=wp.int32),
     node_viscosity: wp.array(dtype=wp.float64),
     viscosity: wp.array(dtype=wp.float64),
-    values_out: wp.array2d(dtype=wp.float64),
+    values_out: wp.array2d(dtype=Any),
 ):
     """Add the pseudo-viscosity to the diagonal, with which each row begins."""
     i, k = wp.tid()
     slot = slots[i]
-    values_out[slot, starts[k]] += viscosity[slot] * node_viscosity[k]
-
-
-@wp.func
-def raise_to(numbers: wp.array2d(dtype=wp.float64), slot: int, place: int, value: wp.float64):
-    """Raise a maximum; most values are below it, and need no atomic operation."""
-    if value > numbers[slot, place]:
-        wp.atomic_max(numbers, slot, place, value)
-
-
-@wp.kernel
-def clear_numbers(slots: wp.array(dtype=wp.int32), numbers_out: wp.array2d(dtype=wp.float64)):
-    """Begin the sums and maxima of the listed slots."""
-    i, k = wp.tid()
-    numbers_out[slots[i], k] = wp.float64(0.0)
-    if k == JACOBIAN:
-        numbers_out[slots[i], k] = wp.float64(1.0e30)
-
-
-@wp.kernel
-def sum_nodes(
-    slots: wp.array(dtype=wp.int32),
-    held: wp.array(dtype=wp.int32),
-    nodes: int,
-    internal_in: wp.array(dtype=wp.vec3d),
-    indenter_in: wp.array(dtype=wp.vec3d),
-    core_in: wp.array(dtype=wp.vec3d),
-    gradient_in: wp.array(dtype=wp.vec3d),
-    fluid_pressure_in: wp.array(dtype=wp.float64),
-    unbalanced_out: wp.array(dtype=wp.vec3d),
-    numbers_out: wp.array2d(dtype=wp.float64),
-):
-    """Unbalanced force of each node, and the sums of squares of all forces; see `ForceBalance`."""
-    i, k = wp.tid()
-    slot = slots[i]
-    at = slot * nodes + k
-    fluid = fluid_pressure_in[slot] * gradient_in[at]
-    total = internal_in[at] + indenter_in[at] + core_in[at] - fluid
-    unbalanced = wp.float64(0.0)
-    internal = wp.float64(0.0)
-    by_fluid = wp.float64(0.0)
-    by_indenter = wp.float64(0.0)
-    by_core = wp.float64(0.0)
-    for c in range(3):
-        if held[3 * k + c] != 0:
-            total[c] = wp.float64(0.0)
-            internal += internal_in[at][c] * internal_in[at][c]
-        else:
-            unbalanced += total[c] * total[c]
-            by_fluid += fluid[c] * fluid[c]
-            by_indenter += indenter_in[at][c] * indenter_in[at][c]
-            by_core += core_in[at][c] * core_in[at][c]
-    unbalanced_out[at] = total
-    wp.atomic_add(numbers_out, slot, UNBALANCED, unbalanced)
-    if internal != wp.float64(0.0):
-        wp.atomic_add(numbers_out, slot, INTERNAL, internal)
-    if by_fluid != wp.float64(0.0):
-        wp.atomic_add(numbers_out, slot, FLUID, by_fluid)
-    if by_indenter != wp.float64(0.0):
-        wp.atomic_add(numbers_out, slot, INDENTER, by_indenter)
-    if wp.length_sq(indenter_in[at]) > wp.float64(0.0):
-        for c in range(3):
-            wp.atomic_add(numbers_out, slot, NET + c, indenter_in[at][c])
-    if by_core != wp.float64(0.0):
-        wp.atomic_add(numbers_out, slot, CORE, by_core)
-
-
-@wp.kernel
-def sum_elements(
-    slots: wp.array(dtype=wp.int32),
-    elements: int,
-    rest_volume: wp.array(dtype=wp.float64),
-    bulk_over_volume: wp.array(dtype=wp.float64),
-    volume_in: wp.array(dtype=wp.float64),
-    jacobian_in: wp.array(dtype=wp.float64),
-    pressure_in: wp.array(dtype=wp.float64),
-    numbers_out: wp.array2d(dtype=wp.float64),
-):
-    """Largest error of an element's volume, and the smallest Jacobian."""
-    i, k = wp.tid()
-    slot = slots[i]
-    at = slot * elements + k
-    excess = volume_in[at] - rest_volume[k] - pressure_in[at] / bulk_over_volume[k]
-    raise_to(numbers_out, slot, STRAIN, wp.abs(excess) / rest_volume[k])
-    if jacobian_in[at] < numbers_out[slot, JACOBIAN]:
-        wp.atomic_min(numbers_out, slot, JACOBIAN, jacobian_in[at])
-
-
-@wp.kernel
-def sum_cavity(
-    slots: wp.array(dtype=wp.int32),
-    faces: int,
-    volume_in: wp.array(dtype=wp.float64),
-    numbers_out: wp.array2d(dtype=wp.float64),
-):
-    """Volume of the cavity."""
-    i, k = wp.tid()
-    wp.atomic_add(numbers_out, slots[i], VOLUME, volume_in[slots[i] * faces + k])
-
-
-@wp.kernel
-def sum_contact(
-    items: wp.array(dtype=wp.int32),
-    each: int,
-    wanted_in: wp.array2d(dtype=wp.float64),
-    pressure_in: wp.array2d(dtype=wp.float64),
-    wanted_traction_in: wp.array2d(dtype=wp.vec3d),
-    traction_in: wp.array2d(dtype=wp.vec3d),
-    status_in: wp.array2d(dtype=wp.int32),
-    frozen_in: wp.array2d(dtype=wp.int32),
-    numbers_out: wp.array2d(dtype=wp.float64),
-):
-    """Largest misfits of pressures and tractions [Pa], and whether the active set has changed."""
-    f = items[wp.tid()]
-    slot = f // each
-    for q in range(wanted_in.shape[1]):
-        raise_to(numbers_out, slot, GAP, wp.abs(wanted_in[f, q] - pressure_in[f, q]))
-        for c in range(3):
-            apart = wp.abs(wanted_traction_in[f, q][c] - traction_in[f, q][c])
-            raise_to(numbers_out, slot, TRACTION, apart)
-            raise_to(numbers_out, slot, LARGEST, wp.abs(traction_in[f, q][c]))
-        if status_in[f, q] != frozen_in[f, q]:
-            numbers_out[slot, CHANGED] = wp.float64(1.0)
-
-
-@wp.kernel
-def longest_moves(
-    slots: wp.array(dtype=wp.int32),
-    nodes: int,
-    field_in: wp.array(dtype=wp.vec3d),
-    longest_out: wp.array(dtype=wp.float64),
-):
-    """Square of the longest move of a node; not a number where a move is none."""
-    i, k = wp.tid()
-    slot = slots[i]
-    size = wp.length_sq(field_in[slot * nodes + k])
-    if size >= wp.float64(0.0):
-        if size > longest_out[slot]:
-            wp.atomic_max(longest_out, slot, size)
-    else:
-        wp.atomic_max(longest_out, slot, wp.float64(1.0e300))
+    values_out[slot, starts[k]] += values_out.dtype(viscosity[slot] * node_viscosity[k])
 
 
 @wp.kernel

@@ -99,7 +99,7 @@ def add_to_means(
         wp.atomic_add(mean_out, begin + faces[s, a], weight[s, q, a] * gap)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 3))
 def mean_gaps_to_indenter(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),

@@ -6,6 +6,7 @@ A front has its own rows and those of its border in one stretch of a vector; ``f
 right-hand side and the children give to a front, and at last the solution; *half* has what the
 lower triangle is solved for. Triangles along the diagonal are inverted, so their rows do not wait
 for each other: a step of a level is one such triangle of each front, and what stands below it.
+Levels whose fronts are small have a block of threads for each front instead.
 """
 
 from __future__ import annotations
@@ -146,6 +147,60 @@ def solve_columns(
         panels_in, slot * panel_tiles + fronts[front, 4], own, c,
         wp.where(subtract != 0, end, c), wp.where(subtract != 0, fronts[front, 1], end),
         source, begin, out, begin + wp.static(TILE) * c, subtract, thread,
+    )  # fmt: skip
+
+
+@wp.kernel
+def solve_small_fronts(
+    slots: wp.array(dtype=wp.int32),
+    listed: wp.array(dtype=wp.int32),
+    fronts: wp.array2d(dtype=wp.int32),
+    row_links: wp.array(dtype=wp.int32),
+    children: wp.array2d(dtype=wp.int32),
+    rows_in_child: wp.array(dtype=wp.int32),
+    first: int,
+    rows: int,
+    panel_tiles: int,
+    lanes: int,
+    vectors_in: wp.array3d(dtype=wp.float64),
+    panels_in: wp.array3d(dtype=wp.float32),
+    begun: wp.array2d(dtype=wp.float32),
+    half_out: wp.array2d(dtype=wp.float32),
+):
+    """The way up through the fronts of a level: a block of threads for each.
+
+    One front of all slots after another, so that they find the same numbers of places in caches.
+    """
+    number, i, thread = wp.tid()
+    slot = slots[i]
+    front = listed[first + number]
+    dense_vectors.solve_small_rows(
+        row_links, children, rows_in_child, fronts[front, 2], fronts[front, 3], fronts[front, 6],
+        vectors_in, slot, lanes, panels_in, slot * panel_tiles + fronts[front, 4],
+        fronts[front, 0], fronts[front, 1], slot * rows, begun, half_out, thread,
+    )  # fmt: skip
+
+
+@wp.kernel
+def answer_small_fronts(
+    slots: wp.array(dtype=wp.int32),
+    listed: wp.array(dtype=wp.int32),
+    fronts: wp.array2d(dtype=wp.int32),
+    row_links: wp.array(dtype=wp.int32),
+    first: int,
+    rows: int,
+    panel_tiles: int,
+    panels_in: wp.array3d(dtype=wp.float32),
+    half_in: wp.array2d(dtype=wp.float32),
+    begun: wp.array2d(dtype=wp.float32),
+):
+    """The way down again."""
+    number, i, thread = wp.tid()
+    slot = slots[i]
+    front = listed[first + number]
+    dense_vectors.solve_small_columns(
+        row_links, fronts[front, 6], panels_in, slot * panel_tiles + fronts[front, 4],
+        fronts[front, 0], fronts[front, 1], slot * rows, begun, half_in, thread,
     )  # fmt: skip
 
 

@@ -132,7 +132,8 @@ class BatchedState:
         outputs: list[wp.array],
     ) -> None:  # fmt: skip
         each = self._each[name]
-        self._launches(kernel, (len(slots), each), [slots, each, *inputs], outputs)
+        dim = (len(slots), kernels.threads_for(each))
+        self._launches(kernel, dim, [slots, each, *inputs], outputs)
 
 
 def flat(array: wp.array) -> wp.array:

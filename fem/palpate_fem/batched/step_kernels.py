@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from palpate_fem.batched.kernels import raise_to
+from palpate_fem.batched.reductions import raise_to
 
 wp.set_module_options({"enable_backward": False})
 

@@ -144,7 +144,7 @@ def friction_law(
     return answer
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 2))
 def indenter_contact(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
@@ -195,14 +195,15 @@ def indenter_contact(
     near = indenter_distance(shape_of, local, margin)
     gap = near.gap + correction_in[f, q]
     gap_out[f, q] = gap
-    status_out[f, q] = 0
-    wanted_out[f, q] = wp.float64(0.0)
-    slope_out[f, q] = wp.vec3d()
-    misfit_out[f, q] = wp.vec3d()
-    wanted_traction_out[f, q] = wp.vec3d()
-    traction_slope_out[f, q] = wp.mat33d()
-    coupled_out[f, q] = wp.vec3d()
-    unsymmetric_out[f, q] = wp.mat33d()
+    if status_out[f, q] != 0:  # else the results of a point that does not touch stand there
+        status_out[f, q] = 0
+        wanted_out[f, q] = wp.float64(0.0)
+        slope_out[f, q] = wp.vec3d()
+        misfit_out[f, q] = wp.vec3d()
+        wanted_traction_out[f, q] = wp.vec3d()
+        traction_slope_out[f, q] = wp.mat33d()
+        coupled_out[f, q] = wp.vec3d()
+        unsymmetric_out[f, q] = wp.mat33d()
     p = pressure_in[f, q]
     # Points beyond the margin have no pressure: it was set to zero when they separated.
     if near.gap < margin:
@@ -505,10 +506,11 @@ def core_contact(
     cell = grid_cell(coefficients, origin, spacing, x)
     rough = coefficients[cell[0], cell[1], cell[2]]
     gap_out[f, q] = rough
-    status_out[f, q] = 0
-    wanted_out[f, q] = wp.float64(0.0)
-    slope_out[f, q] = wp.vec3d()
-    misfit_out[f, q] = wp.vec3d()
+    if status_out[f, q] != 0:
+        status_out[f, q] = 0
+        wanted_out[f, q] = wp.float64(0.0)
+        slope_out[f, q] = wp.vec3d()
+        misfit_out[f, q] = wp.vec3d()
     p = pressure_in[f, q]
     if rough < margin or p > wp.float64(0.0):
         near = core_distance(coefficients, origin, spacing, x)
@@ -544,7 +546,7 @@ def load_at_point(
     return load
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 3))
 def mortar_on_indenter(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),
