@@ -443,7 +443,7 @@ class BatchedEquations:
         field = self._cleared_field(listed)
         self._launch(
             element_kernels.pressure_misfit,
-            len(listed.elements),
+            (len(listed.elements), self._elements.shape[1]),
             [*self._condensed, listed.elements, self._volume, self._frozen_gradient,
              state.pressure],
             [field],
@@ -475,7 +475,15 @@ class BatchedEquations:
         self._launch(
             contact_kernels.unsymmetric_product,
             len(listed.outer),
-            [outer.faces, outer.shape, self._nodes, listed.outer, outer.frozen_unsymmetric, moved],
+            [
+                outer.faces,
+                outer.shape,
+                self._nodes,
+                listed.outer,
+                outer.frozen_status,
+                outer.frozen_unsymmetric,
+                moved,
+            ],
             [field],
         )
         self._spread(state, listed, field, change=moved)

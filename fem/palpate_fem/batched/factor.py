@@ -1,9 +1,9 @@
 """Cholesky factors of many matrices of one pattern at once: multifrontal, in tiles, on a GPU.
 
 The elimination tree is that of the CPU's solver (``ordering``). Its fronts are worked on level by
-level, leaves first, for all listed matrices together. Matrices, factors, and the vectors of a solve are
-kept in single precision; sums are added up in double. There is no pivoting: a matrix that is not
-positive definite is reported (ADR 0026).
+level, leaves first, for all listed matrices together. Matrices, factors, and the vectors of a solve
+are kept in single precision; sums of a factorisation are added up in double. There is no pivoting:
+a matrix that is not positive definite is reported (ADR 0026).
 
 A front whose entries, and whose children, are what they were at the last factorisation is left as
 it is. Where only contact has changed, that is most of them.

@@ -18,9 +18,10 @@ import warp as wp
 
 from palpate_fem.batched import dense_panels, dense_tiles
 from palpate_fem.batched.dense_tiles import THREADS, WIDE
-from palpate_fem.batched.kernels import ENTRIES
+from palpate_fem.batched.kernels import ENTRIES, Entries, place_of
 
 wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def lower_tile(row: int, column: int):
@@ -58,11 +59,19 @@ def mark_changed(
     slot = slots[i]
     if thread == 0:
         bad_out[slot] = 0
-    entries = values_in.shape[1]
-    for k in range(thread, entries, (entries + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
-        value = values_in[slot, k]
-        if value != known[slot, k]:
-            known[slot, k] = value
+    count = values_in.shape[1]
+    held = Entries()
+    changed = wp.int32(0)
+    for n in range(wp.static(ENTRIES)):
+        k = place_of(thread, n, count)
+        if k < count:
+            held[n] = wp.float64(values_in[slot, k])
+            if values_in[slot, k] != known[slot, k]:
+                changed |= 1 << n
+    for n in range(wp.static(ENTRIES)):
+        if (changed >> n) & 1 != 0:
+            k = place_of(thread, n, count)
+            known[slot, k] = wp.float32(held[n])
             front = front_of[k]
             while front >= 0 and marked[slot, front] == 0:
                 marked[slot, front] = 1

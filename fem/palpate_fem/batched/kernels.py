@@ -19,12 +19,23 @@ ENTRIES = 4
 """Entries that a thread clears, copies or compares, where it does nothing else."""
 
 
+Entries = wp.types.vector(length=ENTRIES, dtype=wp.float64)
+"""What a thread reads before it writes any of it, as it would wait for each otherwise."""
+
+
 def threads_for(count: int) -> int:
     """Threads that clear or copy so many entries of a slot."""
     return -(-count // ENTRIES)
 
 
+@wp.func
+def place_of(thread: int, n: int, count: int) -> int:
+    """Place of entry n of a thread; neighbouring threads have neighbours."""
+    return thread + n * ((count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES))
+
+
 wp.set_module_options({"enable_backward": False})
+
 
 @wp.kernel
 def expand(slots: wp.array(dtype=wp.int32), count: int, items_out: wp.array(dtype=wp.int32)):
@@ -47,8 +58,10 @@ def clear_rows(
     """Set ``count`` numbers of each listed slot to zero; for `threads_for` them."""
     i, thread = wp.tid()
     begin = slots[i] * count
-    for k in range(thread, count, (count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
-        numbers_out[begin + k] = wp.float64(0.0)
+    for n in range(wp.static(ENTRIES)):
+        k = place_of(thread, n, count)
+        if k < count:
+            numbers_out[begin + k] = wp.float64(0.0)
 
 
 @wp.kernel
@@ -61,8 +74,15 @@ def copy_rows(
     """Copy ``count`` numbers of each listed slot; for `threads_for` them."""
     i, thread = wp.tid()
     begin = slots[i] * count
-    for k in range(thread, count, (count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
-        copy_out[begin + k] = source_in[begin + k]
+    held = Entries()
+    for n in range(wp.static(ENTRIES)):
+        k = place_of(thread, n, count)
+        if k < count:
+            held[n] = source_in[begin + k]
+    for n in range(wp.static(ENTRIES)):
+        k = place_of(thread, n, count)
+        if k < count:
+            copy_out[begin + k] = held[n]
 
 
 @wp.kernel
@@ -75,8 +95,10 @@ def copy_integers(
     """`copy_rows` of integers."""
     i, thread = wp.tid()
     begin = slots[i] * count
-    for k in range(thread, count, (count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
-        copy_out[begin + k] = source_in[begin + k]
+    for n in range(wp.static(ENTRIES)):
+        k = place_of(thread, n, count)
+        if k < count:
+            copy_out[begin + k] = source_in[begin + k]
 
 
 @wp.kernel
@@ -92,14 +114,19 @@ def extrapolate(
     """Now + ratio (now - before); not below zero where ``positive``. For `threads_for` them."""
     i, thread = wp.tid()
     slot = slots[i]
-    for k in range(thread, count, (count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
-        at = slot * count + k
-        value = now_in[at]
-        if ratio[slot] != wp.float64(0.0):
-            value += ratio[slot] * (value - before_in[at])
-        if positive != 0:
-            value = wp.max(value, wp.float64(0.0))
-        trial_out[at] = value
+    held = Entries()
+    for n in range(wp.static(ENTRIES)):
+        k = place_of(thread, n, count)
+        if k < count:
+            held[n] = now_in[slot * count + k]
+            if ratio[slot] != wp.float64(0.0):
+                held[n] += ratio[slot] * (held[n] - before_in[slot * count + k])
+            if positive != 0:
+                held[n] = wp.max(held[n], wp.float64(0.0))
+    for n in range(wp.static(ENTRIES)):
+        k = place_of(thread, n, count)
+        if k < count:
+            trial_out[slot * count + k] = held[n]
 
 
 @wp.kernel
@@ -242,8 +269,15 @@ def gather_values(
     slot = slots[i]
     begin = slot * blocks * 9
     count = gather.shape[0]
-    for k in range(thread, count, (count + wp.static(ENTRIES - 1)) // wp.static(ENTRIES)):
-        values_out[slot, k] = values_out.dtype(sum_in[begin + gather[k]])
+    held = Entries()
+    for n in range(wp.static(ENTRIES)):
+        k = place_of(thread, n, count)
+        if k < count:
+            held[n] = sum_in[begin + gather[k]]
+    for n in range(wp.static(ENTRIES)):
+        k = place_of(thread, n, count)
+        if k < count:
+            values_out[slot, k] = values_out.dtype(held[n])
 
 
 @wp.kernel

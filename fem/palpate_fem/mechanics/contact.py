@@ -209,7 +209,7 @@ class ContactSurface:
         launch(
             contact_kernels.unsymmetric_product,
             len(self._sliding),
-            [self.faces, self.shape, self.nodes, self._sliding, self._frozen[3]],
+            [self.faces, self.shape, self.nodes, self._sliding, *self._frozen[2:]],
             [change, product],
         )
         if self._correction.spread.nnz:

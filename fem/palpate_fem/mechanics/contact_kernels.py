@@ -272,6 +272,7 @@ def unsymmetric_product(
     shape: wp.array2d(dtype=wp.float64),
     nodes: int,
     items: wp.array(dtype=wp.int32),
+    status_in: wp.array2d(dtype=wp.int32),
     unsymmetric_in: wp.array2d(dtype=wp.mat33d),
     vector_in: wp.array(dtype=wp.vec3d),
     product_out: wp.array(dtype=wp.vec3d),
@@ -281,8 +282,9 @@ def unsymmetric_product(
     s = f % faces.shape[0]
     begin = (f // faces.shape[0]) * nodes
     for q in range(shape.shape[0]):
-        moved = unsymmetric_in[f, q] * at_point(faces, shape, vector_in, s, q, begin)
-        add_at_nodes(faces, shape, moved, s, q, begin, product_out)
+        if status_in[f, q] > 0:
+            moved = unsymmetric_in[f, q] * at_point(faces, shape, vector_in, s, q, begin)
+            add_at_nodes(faces, shape, moved, s, q, begin, product_out)
 
 
 @wp.kernel

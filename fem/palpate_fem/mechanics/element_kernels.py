@@ -142,27 +142,6 @@ def element_state(
     smallest_jacobian_out[e] = smallest
 
 
-@wp.func
-def put_matrix(matrix: wp.mat33d, at: int, numbers_out: wp.array2d(dtype=wp.float64)):
-    """Write a matrix, each of its nine numbers to a row of its own.
-
-    On a GPU neighbouring threads then write neighbouring numbers: a third of the time.
-    """
-    for i in range(3):
-        for j in range(3):
-            numbers_out[3 * i + j, at] = matrix[i, j]
-
-
-@wp.func
-def matrix_at(numbers_in: wp.array2d(dtype=wp.float64), at: int) -> wp.mat33d:
-    """What `put_matrix` has written."""
-    matrix = wp.mat33d()
-    for i in range(3):
-        for j in range(3):
-            matrix[i, j] = numbers_in[3 * i + j, at]
-    return matrix
-
-
 @wp.func_native("""
 #ifdef __CUDA_ARCH__
     const int point = threadIdx.x % 8;
@@ -533,13 +512,16 @@ def pressure_misfit(
     pressure_in: wp.array(dtype=wp.float64),
     force_out: wp.array(dtype=wp.vec3d),
 ):
-    """Add the load on the nodes by static condensation of the element pressures."""
-    e = items[wp.tid()]
+    """Add the load on the nodes by static condensation of the element pressures.
+
+    A thread for each corner.
+    """
+    item, a = wp.tid()
+    e = items[item]
     s = e % elements.shape[0]
-    begin = (e // elements.shape[0]) * nodes
+    node = (e // elements.shape[0]) * nodes + elements[s, a]
     misfit = bulk_over_volume[s] * (volume_in[e] - rest_volume[s]) - pressure_in[e]
-    for a in range(elements.shape[1]):
-        wp.atomic_add(force_out, begin + elements[s, a], misfit * volume_gradient_in[e, a])
+    wp.atomic_add(force_out, node, misfit * volume_gradient_in[e, a])
 
 
 @wp.kernel

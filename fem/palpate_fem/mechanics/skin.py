@@ -131,7 +131,7 @@ class SkinElements:
         """Add the load on the nodes by static condensation of the element pressures."""
         launch(
             element_kernels.pressure_misfit,
-            self.count,
+            self._volume_gradient.shape,
             [*self._condensed, scalars(pressure)],
             [force],
         )
