@@ -270,6 +270,8 @@ def test_offsets_that_follow(batch: Batch) -> None:
     before = batch.vectors.numpy()[:, 1].copy()
     equations.subtract_offset_force(following, batch.change, 0, batch.vectors, 1)
     found = before - batch.vectors.numpy()[:, 1]
+    for surface in (equations.outer, equations.inner):  # of nodes of other surfaces, too: none
+        assert np.abs(surface.offset_change.numpy()).max() < 1e-3
     equations.targets(batch.all, batch.change, 0, following=following)
     # The offsets of a flat face, the cube's, do not change.
     largest = [np.abs(case.vectors["offsets"]).max() for case in batch.cases]

@@ -211,6 +211,16 @@ def test_columns_by_many_blocks_have_the_bits_of_panels_by_one(body: int) -> Non
     np.testing.assert_array_equal(found[0], found[2])
 
 
+def test_solutions_do_not_depend_on_the_size_of_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for filled in (0, 10**6):  # threads that keep a processor busy: blocks of 64, and of 256
+        monkeypatch.setattr("palpate_fem.batched.factor.FILLED", filled)
+        bench = Bench([two_bodies(100, 150, seed) for seed in (8, 4)])
+        bench.factorise()
+        found.append(bench.solve(bench.right(2)))
+    np.testing.assert_array_equal(found[0], found[1])
+
+
 def test_only_what_has_changed_is_factorised_again(grids: Bench) -> None:
     """And gives the bits of a factorisation of everything."""
     bench = restored(grids)

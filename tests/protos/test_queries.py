@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
+import queue
 import threading
 import time
 from collections.abc import Callable
@@ -13,7 +15,7 @@ import pytest
 import zenoh
 
 from palpate.bus import MAX_PAYLOAD_BYTES, Cancellation, Session, endpoints
-from palpate.bus.query import ask_again
+from palpate.bus.query import LONGEST_S, ask_again
 from palpate.bus.topics import sensor_key
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import (
@@ -36,6 +38,35 @@ TIMEOUT_S = 20.0
 def _tare(session: Session, *, timeout_s: float = TIMEOUT_S) -> Tare:
     reply: Tare = session.query(endpoints.TARE, TareRequest(), sensor="finger", timeout_s=timeout_s)
     return reply
+
+
+def _asked_aside(
+    session: Session, *, timeout_s: float, cancellation: Cancellation | None = None
+) -> Callable[[float], list[object]]:
+    """Asks in a thread of its own; tells the tare's id or the problem, or nothing in so long [s]."""
+    answers: list[object] = []
+
+    def ask() -> None:
+        with cancellation or contextlib.nullcontext():
+            try:
+                answers.append(_tare(session, timeout_s=timeout_s).tare_id)
+            except PalpateError as error:
+                answers.append(error.problem)
+
+    asker = threading.Thread(target=ask, daemon=True)
+    asker.start()
+
+    def answer(wait_s: float) -> list[object]:
+        asker.join(wait_s)
+        return answers
+
+    return answer
+
+
+@pytest.fixture
+def always_young(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sessions have just joined, however long a busy machine takes."""
+    monkeypatch.setattr("palpate.bus.link._YOUNG_S", 10 * TIMEOUT_S)
 
 
 def _reached(session: Session) -> bool:
@@ -100,6 +131,53 @@ def test_a_service_that_is_not_there_is_not_blamed_for_its_answer(pair: Any) -> 
     _, b = pair
     with pytest.raises(LinkError, match=f"no service answers on {KEY}"):
         _tare(b)
+
+
+def test_a_long_wait_is_not_waited_out_where_nobody_serves(pair: Any) -> None:
+    _, b = pair
+    answer = _asked_aside(b, timeout_s=LONGEST_S)
+    assert answer(TIMEOUT_S) == [f"no service answers on {KEY}"]
+
+
+def test_a_session_that_has_just_joined_waits_until_it_knows_who_serves(
+    pair: Any, examples: dict[str, Any], always_young: None
+) -> None:
+    a, b = pair
+    asked: list[TareRequest] = []
+    tare: Tare = examples["Tare"]
+
+    def handler(request: TareRequest) -> Tare:
+        asked.append(request)
+        return tare
+
+    answer = _asked_aside(b, timeout_s=10 * TIMEOUT_S)
+    assert answer(0.3) == [], "it is not said that nobody serves"
+    a.queryable(endpoints.TARE, handler, sensor="finger")
+    assert answer(TIMEOUT_S) == [tare.tare_id]
+    assert len(asked) == 1
+
+
+def test_a_question_that_is_lost_is_not_sent_again(pair: Any, always_young: None) -> None:
+    """The service may have acted on it; that it is gone does not mean that nobody was asked."""
+    a, b = pair
+    asked: queue.SimpleQueue[zenoh.Query] = queue.SimpleQueue()
+    queryable = a._raw.declare_queryable(KEY, asked.put, complete=True)
+    answer = _asked_aside(b, timeout_s=10 * TIMEOUT_S)
+    question = asked.get(timeout=TIMEOUT_S)
+    queryable.undeclare()
+    question.drop()
+    (said,) = answer(TIMEOUT_S)
+    assert str(said).startswith(f"{KEY} is served, but no answer arrived")
+    assert asked.empty()
+
+
+def test_who_waits_for_a_service_can_be_cancelled(pair: Any, always_young: None) -> None:
+    _, b = pair
+    cancellation = Cancellation()
+    answer = _asked_aside(b, timeout_s=10 * TIMEOUT_S, cancellation=cancellation)
+    assert answer(0.3) == []
+    cancellation.cancel()
+    assert answer(TIMEOUT_S) == [f"no service answers on {KEY}"]
 
 
 def test_a_question_carries_the_time_that_its_caller_waits(

@@ -19,6 +19,9 @@ PARTS = 2
 SMALL = 24
 """Rows of tiles of a small front, at most; no more than `INVERTED` are its own."""
 
+JOBS = 8
+"""Columns of a small front, and parts of them, among which the tiles below its own are shared."""
+
 _VECTORS = (
     """
     using stored = float;  // tiles, vectors and sums
@@ -213,9 +216,9 @@ _BACKWARD = (
             vector[2 * at + n]
                 = links[at] < 0 ? 0.f : begun.data[(size_t(base) + links[at]) * 2 + n];
 #ifdef __CUDA_ARCH__
-    __shared__ float2 sums[INVERTED > warps ? INVERTED : warps][32];
+    __shared__ float2 sums[INVERTED > JOBS ? INVERTED : JOBS][32];
     __syncthreads();
-    const int parts = own < warps ? warps / own : 1;
+    const int parts = own < JOBS ? JOBS / own : 1;  // however many warps there are: the same bits
     for (int job = warp; job < own * parts; job += warps)
         sums[job][column] = column_product(job % own, vector, own + job / own, rows, parts);
     __syncthreads();
@@ -241,7 +244,7 @@ _BACKWARD = (
     for (int i = 0; i < 2 * own_rows; ++i)
         begun_here[i] = column_product(i / 64, other, i / 64, own, i % 64);
 #endif
-""".replace("INVERTED", str(INVERTED))
+""".replace("INVERTED", str(INVERTED)).replace("JOBS", str(JOBS))
 )
 
 
@@ -313,6 +316,7 @@ def solve_small_rows(
 ):
     """What `gather_loads` and `solve_rows` do, for one small front and by one block of threads.
 
+    Results do not depend on how many these are.
     The children are those of `FrontTiles`, from ``child`` on; ``first_row`` is the front's first
     row in a vector, and ``base`` the slot's.
     """

@@ -107,7 +107,9 @@ class BatchedEquations:
         matrices = [room(wp.float64, 9, total * points) for _ in range(2)]
         self._deformations = [*matrices, room(element_kernels.Scales, total, points)]
         self._by_point = wp.get_device(device).is_cuda and corners == points == 8
-        self._elastic = room(wp.mat33d, slots * pattern.blocks)
+        self._plan_shares(pattern.element_pairs, system.inner.pairs.numpy())
+        kind = wp.float32 if wp.get_device(device).is_cuda else wp.float64
+        self._elastic = room(kind, slots * self._shares_each, 9)
         self._sum = room(wp.mat33d, slots * pattern.blocks)
         self._internal, self._gradient_of_volume, self._unbalanced = (
             room(wp.vec3d, slots * self._nodes) for _ in range(3)
@@ -133,6 +135,19 @@ class BatchedEquations:
         self._margin = wp.float64(system.contact.margin_m)
         self._numbers = room(wp.float64, slots, reductions.NUMBERS)
         self._longest = room(wp.float64, slots, 1)
+
+    def _plan_shares(self, of_elements: Ints, of_faces: Ints) -> None:
+        """Which shares of elements and of the fluid's faces each node-pair block adds up."""
+        first, second = np.transpose(self._couples.numpy())
+        of_elements = np.maximum(of_elements[:, first, second], of_elements[:, second, first])
+        blocks = np.concatenate((of_elements.ravel(), of_faces.ravel()))
+        self._first_of_fluid, self._shares_each = of_elements.size, len(blocks)
+        order = np.argsort(blocks, kind="stable")
+        begins = np.searchsorted(blocks[order], np.arange(self._blocks_each + 1))
+        self._share_begins, self._shares = (
+            on_device(values.astype(np.int32), wp.int32, self.device)
+            for values in (begins - begins[0], order[begins[0] :])
+        )
 
     def _kinds(self, indenters: Sequence[Indenter]) -> None:
         """Rows of all indenters, and from which gap on each holds directions."""
@@ -392,7 +407,6 @@ class BatchedEquations:
         inner = self.inner
         if elastic is not None:
             corners = self._volume_gradient.shape[1]
-            self._clear(elastic, 9 * self._blocks_each, self._elastic)
             self._launch(
                 element_kernels.point_deformation,
                 (len(elastic.elements), self._weight.shape[1]),
@@ -402,22 +416,27 @@ class BatchedEquations:
             self._launch(
                 element_kernels.element_tangent_by_pair,
                 (len(elastic.elements), len(self._couples)),
-                [self._pairs, self._couples, self._gradient, self._bulk, self._blocks_each,
-                 elastic.elements, *self._deformations, self._volume_gradient],
+                [self._pairs, self._couples, self._gradient, self._bulk, elastic.elements,
+                 *self._deformations, self._volume_gradient, self._shares_each],
                 [self._elastic],
             )  # fmt: skip
             self._launch(
-                element_kernels.cavity_tangent,
-                len(elastic.inner),
-                [inner.faces, self._form, inner.pairs, self._nodes, self._blocks_each,
-                 elastic.inner, state.fluid_pressure, state.position],
+                element_kernels.cavity_tangent_by_pair,
+                (len(elastic.inner), inner.points**2),
+                [inner.faces, self._form, self._nodes, elastic.inner, state.fluid_pressure,
+                 state.position, self._first_of_fluid, self._shares_each],
                 [self._elastic],
             )  # fmt: skip
             self._copy(
                 elastic, 3 * corners * self._elements_each, self._volume_gradient,
                 self._frozen_gradient,
             )  # fmt: skip
-        self._copy(listed, 9 * self._blocks_each, self._elastic, self._sum)
+        self._launch(
+            kernels.sum_shares,
+            (len(listed.slots), 9 * self._blocks_each),
+            [listed.slots, self._share_begins, self._shares, self._shares_each, self._elastic],
+            [self._flat(self._sum)],
+        )
         for surface, items in ((self.outer, listed.outer), (inner, listed.inner)):
             surface.add_tangent(items, self._blocks_each, self._sum)
             for now, kept, each in surface.frozen:

@@ -26,6 +26,9 @@ from palpate_fem.batched.kernels import threads_for
 from palpate_fem.batched.launches import Launches, Sequences
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
 
+FILLED = 1536
+"""Threads that keep a processor busy: twice as many as it holds at once."""
+
 
 class FrontTiles:
     """Where everything is in tiles; the same for every matrix.
@@ -376,12 +379,16 @@ class BatchedFactor:
     ) -> None:
         """Launch a kernel with a block of threads for each front of a level."""
         first, last = self._front_begins[level : level + 2]
+        count = (last - first) * len(slots)
+        # As few for each as keep all processors busy: in a small block none waits for long.
+        block = next((few for few in (64, 128) if few * count > FILLED * self._processors), THREADS)
         self._launch(
             kernel,
-            (last - first, len(slots), THREADS),
+            (last - first, len(slots), block),
             [slots, self._by_level, self._fronts, *plan, first, self.tiles.rows,
              self.tiles.panel_tiles, *known],
             out,
+            block=block,
         )  # fmt: skip
 
     def _over_tiles(

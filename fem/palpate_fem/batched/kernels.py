@@ -257,6 +257,29 @@ def add_load(
 
 
 @wp.kernel
+def sum_shares(
+    slots: wp.array(dtype=wp.int32),
+    begins: wp.array(dtype=wp.int32),
+    shares: wp.array(dtype=wp.int32),
+    each: int,
+    share_in: wp.array2d(dtype=Any),
+    sum_out: wp.array(dtype=wp.float64),
+):
+    """Set the node-pair blocks to the sums of what elements and faces give to them.
+
+    ``shares`` lists those of a block, from ``begins`` of it up to that of the next one. A thread
+    for each of nine numbers of a block.
+    """
+    i, k = wp.tid()
+    slot = slots[i]
+    block = k // 9
+    total = wp.float64(0.0)
+    for n in range(begins[block], begins[block + 1]):
+        total += wp.float64(share_in[slot * each + shares[n], k % 9])
+    sum_out[slot * 9 * (begins.shape[0] - 1) + k] = total
+
+
+@wp.kernel
 def gather_values(
     slots: wp.array(dtype=wp.int32),
     gather: wp.array(dtype=wp.int32),

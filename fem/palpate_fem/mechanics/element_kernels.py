@@ -33,6 +33,8 @@ once.
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 VOLUME_BARRIER = 60.0
@@ -429,23 +431,32 @@ def element_tangent(
                 wp.atomic_add(block_out, begin + block, k)
 
 
-@wp.kernel
+@wp.func
+def put_share(share: wp.mat33d, at: int, share_out: wp.array2d(dtype=Any)):
+    """Write what one element or face gives to a block, row by row."""
+    for i in range(3):
+        for j in range(3):
+            share_out[at, 3 * i + j] = share_out.dtype(share[i, j])
+
+
+@wp.kernel(launch_bounds=(256, 3))
 def element_tangent_by_pair(
     pair: wp.array3d(dtype=wp.int32),
     couples: wp.array(dtype=wp.vec2i),
     gradient: wp.array3d(dtype=wp.vec3d),
     bulk_over_volume: wp.array(dtype=wp.float64),
-    blocks: int,
     items: wp.array(dtype=wp.int32),
     deformation_in: wp.array2d(dtype=wp.float64),
     inverse_in: wp.array2d(dtype=wp.float64),
     scales_in: wp.array2d(dtype=Scales),
     volume_gradient_in: wp.array2d(dtype=wp.vec3d),
-    block_out: wp.array(dtype=wp.mat33d),
+    each: int,
+    share_out: wp.array2d(dtype=Any),
 ):
     """`element_tangent` with a thread for each pair of corners, for a GPU, which has so many.
 
-    ``couples`` has each pair of corners in one order, which need not be that of their nodes.
+    ``couples`` has each pair of corners in one order, which need not be that of their nodes. Sets
+    the first of the ``each`` shares of a mesh in its blocks, for one element after another.
     """
     item, couple = wp.tid()
     e = items[item]
@@ -471,7 +482,7 @@ def element_tangent_by_pair(
             scales, inverse * of_a, gb, left_of(scales, f, of_a), left_b, left_b + scales[4] * gb
         )
     k += diagonal * wp.identity(n=3, dtype=wp.float64)
-    wp.atomic_add(block_out, (e // pair.shape[0]) * blocks + pair[s, a, b], k)
+    put_share(k, (e // pair.shape[0]) * each + s * couples.shape[0] + couple, share_out)
 
 
 @wp.kernel
@@ -590,6 +601,23 @@ def cavity_volume(
     volume_out[f] = volume
 
 
+@wp.func
+def fluid_arm(
+    faces: wp.array2d(dtype=wp.int32),
+    form: wp.array3d(dtype=wp.float64),
+    position_in: wp.array(dtype=wp.vec3d),
+    s: int,
+    a: int,
+    b: int,
+    begin: int,
+) -> wp.vec3d:
+    """Sum over c of C_abc x_c, of which the tangent of corners a and b of face s is made."""
+    arm = wp.vec3d()
+    for c in range(faces.shape[1]):
+        arm += form[a, b, c] * position_in[begin + faces[s, c]]
+    return arm
+
+
 @wp.kernel
 def cavity_tangent(
     faces: wp.array2d(dtype=wp.int32),
@@ -613,7 +641,31 @@ def cavity_tangent(
         for b in range(k):
             block = pair[s, a, b]
             if block >= 0:
-                arm = wp.vec3d()
-                for c in range(k):
-                    arm += form[a, b, c] * position_in[copy * nodes + faces[s, c]]
+                arm = fluid_arm(faces, form, position_in, s, a, b, copy * nodes)
                 wp.atomic_add(block_out, copy * blocks + block, factor * wp.skew(arm))
+
+
+@wp.kernel
+def cavity_tangent_by_pair(
+    faces: wp.array2d(dtype=wp.int32),
+    form: wp.array3d(dtype=wp.float64),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
+    pressure_in: wp.array(dtype=wp.float64),
+    position_in: wp.array(dtype=wp.vec3d),
+    first: int,
+    each: int,
+    share_out: wp.array2d(dtype=Any),
+):
+    """`cavity_tangent` with a thread for each pair of corners.
+
+    Sets the shares of a mesh from ``first`` on, for one face after another.
+    """
+    item, couple = wp.tid()
+    f = items[item]
+    s = f % faces.shape[0]
+    copy = f // faces.shape[0]
+    k = faces.shape[1]
+    arm = fluid_arm(faces, form, position_in, s, couple // k, couple % k, copy * nodes)
+    share = (wp.float64(6.0) * pressure_in[copy]) * wp.skew(arm)
+    put_share(share, copy * each + first + s * k * k + couple, share_out)
