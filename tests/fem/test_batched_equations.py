@@ -360,7 +360,8 @@ def arrays_of(batch: Batch) -> dict[str, wp.array]:
     """All arrays that hold something of each slot."""
     equations, found = batch.equations, {}
     owners = {"": equations, "outer.": equations.outer, "inner.": equations.inner,
-              "state.": batch.state, "start.": batch.start, "batch.": batch}  # fmt: skip
+              "tangents.": equations.tangents, "state.": batch.state, "start.": batch.start,
+              "batch.": batch}  # fmt: skip
     for prefix, owner in owners.items():
         for name, value in vars(owner).items():
             for k, array in enumerate(value if isinstance(value, list) else [value]):

@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from palpate_fem.arrays import Floats, Ints
-from palpate_fem.batched import kernels, mortar_kernels, reductions
+from palpate_fem.batched import kernels, mortar_kernels, point_kernels, reductions
 from palpate_fem.batched.launches import Launches, Sequences
 from palpate_fem.batched.state import (
     BatchedState,
@@ -26,6 +26,7 @@ from palpate_fem.batched.state import (
     rows_of_three,
 )
 from palpate_fem.batched.surface import BatchedSurface
+from palpate_fem.batched.tangents import BatchedTangents
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics import contact_kernels, element_kernels
 from palpate_fem.mechanics.mortar import HANGING_M
@@ -68,7 +69,6 @@ class BatchedEquations:
         mesh, pattern, skin = system.mesh, system.pattern, system.skin
         self._law, self._core_law = system.contact.law(friction), system.contact.law(0.0)
         self._nodes, self._elements_each = len(mesh.nodes), len(mesh.elements)
-        self._blocks_each = pattern.blocks
         self.size = len(pattern.free)
 
         def ints(values: Ints) -> wp.array:
@@ -77,24 +77,18 @@ class BatchedEquations:
         def numbers(values: Floats) -> wp.array:
             return on_device(values, wp.float64, device)
 
-        self._elements, self._pairs = ints(mesh.elements), ints(pattern.element_pairs)
+        self._elements = ints(mesh.elements)
         self._gradient = on_device(skin.gradient_values, wp.vec3d, device)
         # The same, where neighbouring threads have neighbouring quadrature points.
         by_corner = np.swapaxes(skin.gradient_values, 1, 2)
         self._gradient_at_points = on_device(by_corner, wp.vec3d, device).transpose((0, 2, 1))
         self._weight, self._rest_volume = numbers(skin.weight_values), numbers(skin.rest_volume)
         self._bulk = numbers(skin.bulk_over_volume)
-        self._free, self._gather = ints(pattern.free), ints(pattern.gather)
-        self._starts = ints(pattern.indptr[:-1])
-        self._node_viscosity = numbers(system.viscosity)
+        self._free = ints(pattern.free)
         held = np.ones(3 * self._nodes, np.int32)
         held[pattern.free] = 0
         self._held = ints(held)
         total, corners = slots * self._elements_each, mesh.elements.shape[1]
-        self._couples = on_device(
-            np.transpose(np.triu_indices(corners)).astype(np.int32), wp.vec2i, device
-        )
-        points = skin.weight_values.shape[1]
 
         def room(kind: type, *shape: int) -> wp.array:
             return wp.zeros(shape, dtype=kind, device=device)
@@ -103,14 +97,9 @@ class BatchedEquations:
         self._volume_gradient = room(wp.vec3d, total, corners)
         self._frozen_gradient = room(wp.vec3d, total, corners)
         self._target = room(wp.float64, total)
-        # Of quadrature points: F, F^-T and scales, of which tangents are made.
-        matrices = [room(wp.float64, 9, total * points) for _ in range(2)]
-        self._deformations = [*matrices, room(element_kernels.Scales, total, points)]
+        points = skin.weight_values.shape[1]
         self._by_point = wp.get_device(device).is_cuda and corners == points == 8
-        self._plan_shares(pattern.element_pairs, system.inner.pairs.numpy())
-        kind = wp.float32 if wp.get_device(device).is_cuda else wp.float64
-        self._elastic = room(kind, slots * self._shares_each, 9)
-        self._sum = room(wp.mat33d, slots * pattern.blocks)
+        self.tangents = BatchedTangents(system, slots, device)
         self._internal, self._gradient_of_volume, self._unbalanced = (
             room(wp.vec3d, slots * self._nodes) for _ in range(3)
         )
@@ -135,19 +124,6 @@ class BatchedEquations:
         self._margin = wp.float64(system.contact.margin_m)
         self._numbers = room(wp.float64, slots, reductions.NUMBERS)
         self._longest = room(wp.float64, slots, 1)
-
-    def _plan_shares(self, of_elements: Ints, of_faces: Ints) -> None:
-        """Which shares of elements and of the fluid's faces each node-pair block adds up."""
-        first, second = np.transpose(self._couples.numpy())
-        of_elements = np.maximum(of_elements[:, first, second], of_elements[:, second, first])
-        blocks = np.concatenate((of_elements.ravel(), of_faces.ravel()))
-        self._first_of_fluid, self._shares_each = of_elements.size, len(blocks)
-        order = np.argsort(blocks, kind="stable")
-        begins = np.searchsorted(blocks[order], np.arange(self._blocks_each + 1))
-        self._share_begins, self._shares = (
-            on_device(values.astype(np.int32), wp.int32, self.device)
-            for values in (begins - begins[0], order[begins[0] :])
-        )
 
     def _kinds(self, indenters: Sequence[Indenter]) -> None:
         """Rows of all indenters, and from which gap on each holds directions."""
@@ -260,7 +236,7 @@ class BatchedEquations:
         count = len(listed.elements)
         if self._by_point:
             self._launch(
-                element_kernels.element_state_by_point,
+                point_kernels.element_state_by_point,
                 (count, 8),
                 [*self._at_points, *place],
                 results,
@@ -404,56 +380,20 @@ class BatchedEquations:
             elastic: Those whose tangent of skin and fluid is evaluated anew; None = none.
             viscosity: See `PseudoTransient`, (slots,).
         """
-        inner = self.inner
+        inner, tangents = self.inner, self.tangents
         if elastic is not None:
-            corners = self._volume_gradient.shape[1]
-            self._launch(
-                element_kernels.point_deformation,
-                (len(elastic.elements), self._weight.shape[1]),
-                [*self._at_points, elastic.elements, state.position, state.pressure],
-                self._deformations,
-            )
-            self._launch(
-                element_kernels.element_tangent_by_pair,
-                (len(elastic.elements), len(self._couples)),
-                [self._pairs, self._couples, self._gradient, self._bulk, elastic.elements,
-                 *self._deformations, self._volume_gradient, self._shares_each],
-                [self._elastic],
+            tangents.evaluate(
+                state, elastic, self._at_points, [self._gradient, self._bulk],
+                self._volume_gradient, inner, self._form,
             )  # fmt: skip
-            self._launch(
-                element_kernels.cavity_tangent_by_pair,
-                (len(elastic.inner), inner.points**2),
-                [inner.faces, self._form, self._nodes, elastic.inner, state.fluid_pressure,
-                 state.position, self._first_of_fluid, self._shares_each],
-                [self._elastic],
-            )  # fmt: skip
-            self._copy(
-                elastic, 3 * corners * self._elements_each, self._volume_gradient,
-                self._frozen_gradient,
-            )  # fmt: skip
-        self._launch(
-            kernels.sum_shares,
-            (len(listed.slots), 9 * self._blocks_each),
-            [listed.slots, self._share_begins, self._shares, self._shares_each, self._elastic],
-            [self._flat(self._sum)],
-        )
+            each = 3 * self._volume_gradient.shape[1] * self._elements_each
+            self._copy(elastic, each, self._volume_gradient, self._frozen_gradient)
+        tangents.begin(listed)
         for surface, items in ((self.outer, listed.outer), (inner, listed.inner)):
-            surface.add_tangent(items, self._blocks_each, self._sum)
+            surface.add_tangent(items, tangents.blocks_each, tangents.blocks)
             for now, kept, each in surface.frozen:
                 self._copy(listed, each * surface.count, now, kept)
-        count = len(listed.slots)
-        self._launch(
-            kernels.gather_values,
-            (count, kernels.threads_for(len(self._gather))),
-            [listed.slots, self._gather, self._blocks_each, self._flat(self._sum)],
-            [values],
-        )
-        self._launch(
-            kernels.add_viscosity,
-            (count, self.size),
-            [listed.slots, self._starts, self._node_viscosity, viscosity],
-            [values],
-        )
+        tangents.write(listed, viscosity, values)
 
     def right_hand_side(
         self, state: BatchedState, listed: Listed, vectors: wp.array, lane: int
