@@ -63,7 +63,8 @@ def processes(run: dict[str, Any]) -> str:
 def times(runs: list[dict[str, Any]]) -> str:
     """A row for each number of slots and each mesh."""
     head = ["mesh [mm]", "unknowns", "slots", "processes", "presses", "ms a trajectory",
-            "with all slots taken", "iterations", "factorisations", "outcomes"]  # fmt: skip
+            "with all slots taken", "iterations", "factorisations", "outcomes",
+            "kernels of"]  # fmt: skip
     return markdown_table(
         head,
         [
@@ -71,7 +72,7 @@ def times(runs: list[dict[str, Any]]) -> str:
                 f"{run['edge_mm']:g}", f"{run['unknowns']:,}", str(run["slots"]),
                 processes(run), str(run["presses"]), f"{run['ms_a_trajectory']:.0f}",
                 f"**{run['ms_while_full']:.0f}**", f"{run['iterations']:.0f}",
-                f"{run['factorisations']:.0f}", outcomes(run),
+                f"{run['factorisations']:.0f}", outcomes(run), run["commit"],
             ]
             for run in runs
         ],

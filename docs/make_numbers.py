@@ -103,7 +103,7 @@ def _fem() -> Iterator[Claim]:
         "and three with 384 slots **{ms384xxm} ms**",
         figures,
     )
-    yield Claim("docs/twin.md", "{ms192xm} ms a press instead of {ms192}\n", figures)
+    yield Claim("docs/twin.md", "{ms192xxm} ms a press instead of {ms192}\n", figures)
 
 
 def _name_of(run: dict[str, Any]) -> str:

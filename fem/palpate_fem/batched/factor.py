@@ -26,8 +26,8 @@ from palpate_fem.batched.kernels import threads_for
 from palpate_fem.batched.launches import Launches, Sequences
 from palpate_fem.sparse.ordering import EliminationTree, Ints, plan_elimination
 
-FILLED = 1536
-"""Threads that keep a processor busy: twice as many as it holds at once."""
+FILLED = 1024
+"""Threads that keep a processor busy."""
 
 
 class FrontTiles:
