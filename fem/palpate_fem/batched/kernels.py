@@ -382,3 +382,35 @@ def fluid_pressure_change(
     slot = listed[wp.tid()]
     further_out[slot] = (missing_in[slot] - moved_in[slot]) / stiffness_in[slot]
     change_out[slot] += further_out[slot]
+
+
+@wp.kernel
+def pack(
+    slots: wp.array(dtype=wp.int32),
+    each: int,
+    factor: wp.float64,
+    source_in: wp.array(dtype=wp.float64),
+    at: int,
+    packed_out: wp.array2d(dtype=wp.float64),
+):
+    """``each`` numbers of every listed slot, times a factor, from column ``at`` of its row on."""
+    i, k = wp.tid()
+    packed_out[i, at + k] = factor * source_in[slots[i] * each + k]
+
+
+@wp.kernel
+def pack_stress(
+    slots: wp.array(dtype=wp.int32),
+    elements: int,
+    stress_in: wp.array(dtype=wp.mat33d),
+    at: int,
+    packed_out: wp.array2d(dtype=wp.float64),
+):
+    """Stresses xx yy zz yz xz xy of every listed slot, likewise."""
+    i, e = wp.tid()
+    stress = stress_in[slots[i] * elements + e]
+    for c in range(3):
+        packed_out[i, at + 6 * e + c] = stress[c, c]
+    packed_out[i, at + 6 * e + 3] = stress[1, 2]
+    packed_out[i, at + 6 * e + 4] = stress[0, 2]
+    packed_out[i, at + 6 * e + 5] = stress[0, 1]

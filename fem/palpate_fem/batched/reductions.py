@@ -1,10 +1,11 @@
 # mypy: ignore-errors
 """Sums and extremes over the nodes, elements and faces of each slot: numbers that the host reads.
 
-A thread has one node, element or face; the threads of a warp find their sum or extreme together,
-and one of them adds it to the slot's. (With an atomic operation of each thread, the thousands of a
-slot wait for each other.) So all threads of a warp belong to one slot: launches have `padded`
-threads for each.
+Those of a balance, and those of a step of the solution. In the former, of which there are many, a
+thread has one node, element or face; the threads of a warp find their sum or extreme together, and
+one of them adds it to the slot's. (With an atomic operation of each thread, the thousands of a slot
+wait for each other.) So all threads of a warp belong to one slot: launches have `padded` threads
+for each.
 """
 
 from __future__ import annotations
@@ -22,6 +23,12 @@ NUMBERS = 16
 UNBALANCED, INTERNAL, FLUID, INDENTER, CORE = 0, 1, 2, 3, 4  # sums of squares
 VOLUME, STRAIN, GAP, TRACTION, LARGEST, JACOBIAN, CHANGED = 5, 6, 7, 8, 9, 10, 11
 NET = 12  # and 13, 14
+
+SUMS = 16
+"""Numbers of a step that are no fields; places below."""
+
+FORCE, TORQUE, MOMENT = 0, 3, 6  # three each; the last is the sum of pressure x area x point
+AREA, WEIGHT, ON_INDENTER, ON_CORE = 9, 10, 11, 12  # the last two are the largest pressures
 
 
 def padded(count: int) -> int:
@@ -236,3 +243,80 @@ def longest_moves(
         if not (size >= wp.float64(0.0)):
             size = wp.float64(1.0e300)
     raise_to_max(longest_out, slot, 0, size)
+
+
+@wp.kernel
+def sum_forces(
+    slots: wp.array(dtype=wp.int32),
+    nodes: int,
+    position_in: wp.array(dtype=wp.vec3d),
+    force_in: wp.array(dtype=wp.vec3d),
+    sums_out: wp.array2d(dtype=wp.float64),
+):
+    """Net force of the indenter on the skin, and its moment; minus the nodal forces of balance."""
+    i, k = wp.tid()
+    slot = slots[i]
+    force = -force_in[slot * nodes + k]
+    if wp.length_sq(force) > wp.float64(0.0):
+        torque = wp.cross(position_in[slot * nodes + k], force)
+        for c in range(3):
+            wp.atomic_add(sums_out, slot, FORCE + c, force[c])
+            wp.atomic_add(sums_out, slot, TORQUE + c, torque[c])
+
+
+@wp.kernel
+def largest_pressure(
+    items: wp.array(dtype=wp.int32),
+    each: int,
+    pressure_in: wp.array2d(dtype=wp.float64),
+    place: int,
+    sums_out: wp.array2d(dtype=wp.float64),
+):
+    """Largest pressure on the listed faces."""
+    f = items[wp.tid()]
+    for q in range(pressure_in.shape[1]):
+        raise_to(sums_out, f // each, place, pressure_in[f, q])
+
+
+@wp.kernel
+def sum_contact_area(
+    faces: wp.array2d(dtype=wp.int32),
+    shape: wp.array2d(dtype=wp.float64),
+    gradient: wp.array3d(dtype=wp.float64),
+    weight: wp.array(dtype=wp.float64),
+    corner_area: wp.array2d(dtype=wp.float64),
+    nodes: int,
+    items: wp.array(dtype=wp.int32),
+    share: wp.float64,
+    position_in: wp.array(dtype=wp.vec3d),
+    pressure_in: wp.array2d(dtype=wp.float64),
+    sums_out: wp.array2d(dtype=wp.float64),
+):
+    """Area of the corners that touch, and the moment of all pressures.
+
+    A corner touches if its pressure is more than ``share`` of the largest one. Its area now is the
+    integral of its shape function over the face; pressures act on ``corner_area``, that at rest.
+    """
+    f = items[wp.tid()]
+    s = f % faces.shape[0]
+    slot = f // faces.shape[0]
+    touching = share * wp.max(sums_out[slot, ON_INDENTER], wp.float64(1.0))
+    for a in range(faces.shape[1]):
+        p = pressure_in[f, a]
+        if p > wp.float64(0.0):
+            load = p * corner_area[s, a]
+            point = position_in[slot * nodes + faces[s, a]]
+            wp.atomic_add(sums_out, slot, WEIGHT, load)
+            for c in range(3):
+                wp.atomic_add(sums_out, slot, MOMENT + c, load * point[c])
+        if p > touching:
+            area = wp.float64(0.0)
+            for q in range(shape.shape[0]):
+                along = wp.vec3d()
+                across = wp.vec3d()
+                for b in range(faces.shape[1]):
+                    x = position_in[slot * nodes + faces[s, b]]
+                    along += gradient[q, b, 0] * x
+                    across += gradient[q, b, 1] * x
+                area += shape[q, a] * weight[q] * wp.length(wp.cross(along, across))
+            wp.atomic_add(sums_out, slot, AREA, area)

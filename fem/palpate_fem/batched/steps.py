@@ -10,11 +10,10 @@ import numpy as np
 import warp as wp
 
 from palpate_fem.arrays import Floats
-from palpate_fem.batched import step_kernels
+from palpate_fem.batched import kernels, reductions
 from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.launches import Launches
-from palpate_fem.batched.state import BatchedState, Listed, flat, on_device
-from palpate_fem.batched.step_kernels import (
+from palpate_fem.batched.reductions import (
     AREA,
     FORCE,
     MOMENT,
@@ -24,6 +23,7 @@ from palpate_fem.batched.step_kernels import (
     TORQUE,
     WEIGHT,
 )
+from palpate_fem.batched.state import BatchedState, Listed, flat, on_device
 from palpate_fem.mechanics.load_stepping import CONTACT_SHARE
 from palpate_fem.mechanics.reference_element import face_element
 from palpate_fem.result import Convergence, IndentationStep
@@ -114,9 +114,10 @@ class BatchedSteps:
         """Sums of the listed slots."""
         outer, inner = self._equations.outer, self._equations.inner
         slots, count, sums = listed.slots, len(listed.slots), [self._sums]
-        self._launch(step_kernels.clear_sums, (count, SUMS), [slots], sums)
+        dim = (count, kernels.threads_for(SUMS))
+        self._launch(kernels.clear_rows, dim, [slots, SUMS], [flat(self._sums)])
         self._launch(
-            step_kernels.sum_forces,
+            reductions.sum_forces,
             (count, self._nodes),
             [slots, self._nodes, state.position, outer.force],
             sums,
@@ -126,13 +127,13 @@ class BatchedSteps:
             (listed.inner, inner, state.core_pressure, ON_CORE),
         ):
             self._launch(
-                step_kernels.largest_pressure,
+                reductions.largest_pressure,
                 len(items),
                 [items, surface.count, pressure, place],
                 sums,
             )
         self._launch(
-            step_kernels.sum_contact_area,
+            reductions.sum_contact_area,
             len(listed.outer),
             [outer.faces, *self._face, outer.area, self._nodes, listed.outer,
              wp.float64(CONTACT_SHARE), state.position, state.indenter_pressure],
@@ -153,20 +154,20 @@ class BatchedSteps:
             (-1.0, equations.inner.force),
         ):
             self._launch(
-                step_kernels.pack,
+                kernels.pack,
                 (count, 3 * self._nodes),
                 [slots, 3 * self._nodes, wp.float64(factor), flat(array), at],
                 [self._packed],
             )
             at += 3 * self._nodes
         self._launch(
-            step_kernels.pack_stress,
+            kernels.pack_stress,
             (count, self._elements),
             [slots, self._elements, self._stress, at],
             [self._packed],
         )
         self._launch(
-            step_kernels.pack,
+            kernels.pack,
             (count, SUMS),
             [slots, SUMS, wp.float64(1.0), flat(self._sums), at + 6 * self._elements],
             [self._packed],
