@@ -221,12 +221,15 @@ def _recording(link: LinkConfig, station: str, sensor: str, out: Path) -> Iterat
 
 
 def _tare(session: Session, sensor: str, interrupted: threading.Event) -> Tare | None:
-    """Tare the finger as soon as nobody touches it; None = interrupted."""
+    """Tare the finger as soon as nobody touches it; None = interrupted.
+
+    Where no answer came it is asked for again: that it may be tared twice does no harm.
+    """
     give_up_s = time.monotonic() + _LET_GO_S
     while not interrupted.is_set():
         try:
             return ask_tare(session, sensor, frames=0, timeout_s=_TARE_S)
-        except RemoteError:  # it is touched
+        except (LinkError, RemoteError):  # the answer was lost, or the finger is touched
             if time.monotonic() >= give_up_s:
                 raise
             interrupted.wait(_AGAIN_S)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.bus import Session
+from palpate.bus import Session, endpoints
 from palpate.client.estimates import ask_tare, ask_zero
 from palpate.config import LinkConfig
 from palpate.errors import LinkError, printable
@@ -22,10 +22,13 @@ def take_tare(
         StreamTimeout: It does not answer in time.
     """
     with Session.open(link, station=station) as session:
+        # A force/torque sensor has a zero instead of a tare.
+        if session.serves(endpoints.ZERO, sensor=sensor):
+            _print_zero(sensor, ask_zero(session, sensor, readings=frames, timeout_s=timeout_s))
+            return
         try:
             tare = ask_tare(session, sensor, frames=frames, timeout_s=timeout_s)
         except LinkError as not_found:
-            # A force/torque sensor has a zero instead of a tare.
             try:
                 zero = ask_zero(session, sensor, readings=frames, timeout_s=timeout_s)
             except LinkError:

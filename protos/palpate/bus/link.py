@@ -11,7 +11,8 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from functools import partial
 from typing import Any, Self, TypeVar
 
 import zenoh
@@ -24,7 +25,15 @@ from palpate.bus.endpoints import STATUS, Endpoint
 from palpate.bus.foreign import ForeignPublisher, ForeignSubscriber, ForeignToken
 from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
 from palpate.bus.pubsub import Publisher, ReceivedMessage, Subscriber
-from palpate.bus.query import ask, ask_again, first_reply, no_reply, raise_errors
+from palpate.bus.query import (
+    LOOK_S,
+    ask,
+    ask_again,
+    first_reply,
+    is_served,
+    no_reply,
+    raise_errors,
+)
 from palpate.bus.queryable import Queryable, QueryAnswer, single_reply
 from palpate.bus.ring import Alarm
 from palpate.bus.tap import Tap
@@ -430,20 +439,11 @@ class Session(Closing):
         if sensor is not None:
             check_name(sensor, "sensor")
         key = self._key(endpoint, sensor, service, instance)
-        asking = self._asking()
 
         def once(left_s: float) -> R:
-            replies = ask(
-                asking,
-                key,
-                endpoint,
-                request,
-                timeout_s=left_s,
-                everyone=True,
-                on_timings=on_timings,
-            )
+            replies = self._ask(key, endpoint, request, timeout_s=left_s, on_timings=on_timings)
             with contextlib.closing(replies):  # one that hangs does not delay those that answer
-                return first_reply(replies, lambda: self._no_reply(asking, key))
+                return first_reply(replies)
 
         return ask_again(once, timeout_s)
 
@@ -459,8 +459,7 @@ class Session(Closing):
     ) -> list[R | PalpateError]:
         """Every answer; errors are returned, not raised."""
         key = self._key(endpoint, sensor, service, instance)
-        asking = self._asking()
-        replies = ask(asking, key, endpoint, request, timeout_s=timeout_s, everyone=True)
+        replies = self._ask(key, endpoint, request, timeout_s=timeout_s, silence=False)
         return list(replies)
 
     def query_stream(
@@ -480,12 +479,39 @@ class Session(Closing):
         if sensor is not None:
             check_name(sensor, "sensor")
         key = self._key(endpoint, sensor, service, instance)
-        asking = self._asking()
-        replies = ask(asking, key, endpoint, request, timeout_s=timeout_s, everyone=False)
-        return raise_errors(replies, lambda: self._no_reply(asking, key))
+        replies = self._ask(key, endpoint, request, timeout_s=timeout_s, everyone=False)
+        return raise_errors(replies)
 
-    def _no_reply(self, asking: zenoh.Session, key: str) -> LinkError:
-        return no_reply(asking, key, roles=self._link.has_roles)
+    def serves(self, endpoint: Endpoint[Any, Any], *, sensor: str) -> bool:
+        """Whether somebody is known at present to answer this endpoint of a sensor."""
+        key = self._key(endpoint, check_name(sensor, "sensor"), "", "")
+        return is_served(self._asking(), key, LOOK_S)
+
+    def _ask(
+        self,
+        key: str,
+        endpoint: Endpoint[Q, R],
+        request: Q,
+        *,
+        timeout_s: float,
+        everyone: bool = True,
+        silence: bool = True,
+        on_timings: OnTimings | None = None,
+    ) -> Generator[R | PalpateError]:
+        """The replies; with ``silence`` their absence is an error among them."""
+        settle_s = _YOUNG_S if self._young() else 0.0
+        asking = self._asking()
+        return ask(
+            asking,
+            key,
+            endpoint,
+            request,
+            timeout_s=timeout_s,
+            everyone=everyone,
+            settle_s=settle_s,
+            silence=partial(no_reply, asking, key, roles=self._link.has_roles) if silence else None,
+            on_timings=on_timings,
+        )
 
     def caller_token(self, request_id: str) -> CallerToken:
         """Show that this process waits for an answer, until it is closed or this process dies."""
@@ -575,14 +601,19 @@ class Session(Closing):
         """The Zenoh session through which a question reaches whoever serves it.
 
         A young session does not know all of them yet, and would say that nobody does. To ask once
-        more after silence could tare a finger twice, so the way is chosen before.
+        more after silence could tare a finger twice, so the way is chosen before. The router may
+        not know a process, either, whose link to it broke and comes back; so a young session also
+        waits until somebody is known (``settle_s`` of ``ask``).
         """
-        if time.monotonic() - self._opened_s > _YOUNG_S:
+        if not self._young():
             return self._raw
         try:
             return self.observer()._raw
         except LinkError:  # there are only peers
             return self._raw
+
+    def _young(self) -> bool:
+        return time.monotonic() - self._opened_s <= _YOUNG_S
 
     def has_router(self) -> bool:
         """Whether a router is connected at present."""

@@ -1,7 +1,8 @@
 """Asking questions: replies as they come, typed errors, and never more than the time that is given.
 
 A question may be cancelled from another thread, and one that a service refuses for lack of room is
-asked again while there is time.
+asked again while there is time. One that had no reply is never sent again, as the service may have
+acted on it; so where a service may not be known yet, it is waited for before.
 """
 
 from __future__ import annotations
@@ -37,8 +38,12 @@ R = TypeVar("R")
 LONGEST_S = 86_400.0
 """Longest time that a question may take [s]: a day."""
 
+LOOK_S = 0.05
+"""Within this time a session hears from its router who serves a key [s]."""
+
 _RETRIED = (ErrorCode.RESOURCE_EXHAUSTED, ErrorCode.UNAVAILABLE)
-_LOOK_S = 0.05
+_POLL_S = 0.002
+_LEAST_S = 0.001
 _DROPPED = f"larger than a message may be ({MAX_MESSAGE_BYTES >> 20} MiB), so that it was dropped"
 
 
@@ -98,20 +103,27 @@ def ask(
     *,
     timeout_s: float,
     everyone: bool,
+    settle_s: float = 0.0,
+    silence: Callable[[bool], PalpateError] | None = None,
     on_timings: OnTimings | None = None,
 ) -> Generator[R | PalpateError]:
     """Replies to a query as they come; typed errors are yielded as exceptions, not raised.
 
     Closing the iterator cancels the query. All of it may take ``timeout_s``, and the service is
-    told so. The key may have wildcards: ``everyone`` asks every queryable that matches, else the
-    best matching one answers.
+    told how much of it is left. The key may have wildcards: ``everyone`` asks every queryable that
+    matches, else the best matching one answers.
+
+    The query is sent once. Before, somebody who serves the key is waited for, if none is known:
+    ``settle_s`` at most, and half of the time, so that the other half is left for the answer.
+    Without any reply the error of ``silence`` is yielded, if given; it is told whether somebody was
+    known.
 
     Raises:
         ConfigError: The request or the time cannot be sent.
         WireError: The request breaks the contract, or is larger than a message may be (reason
             ``"size"``).
     """
-    check_duration(timeout_s, "timeout_s", most=LONGEST_S)
+    end_s = time.monotonic() + check_duration(timeout_s, "timeout_s", most=LONGEST_S)
     payload = _encoded(endpoint, request)
     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
     stopped = zenoh.CancellationToken()
@@ -120,21 +132,25 @@ def ask(
         cancellation.watch(stopped)
     target = zenoh.QueryTarget.ALL if everyone else zenoh.QueryTarget.BEST_MATCHING
     try:
+        known = is_served(session, key, min(settle_s, timeout_s / 2))
+        left_s = max(end_s - time.monotonic(), _LEAST_S)
         session.get(
             key,
             zenoh.handlers.Callback(replies.put, lambda: replies.put(None)),
             payload=payload,
             encoding=zenoh.Encoding(ENCODING_PREFIX + endpoint.request.schema),
-            attachment=attachment_of(timeout_s),
-            timeout=timeout_s,
+            attachment=attachment_of(left_s),
+            timeout=left_s,
             target=target,
             consolidation=zenoh.ConsolidationMode.NONE,
             cancellation_token=stopped,
         )
     except zenoh.ZError as error:
         raise LinkError(f"cannot ask {key}: {error}", remedy="open the session again") from error
+    silent = True
     try:
         while (item := replies.get()) is not None:
+            silent = False
             if item.err is not None:
                 yield _remote_error(item.err, key, timeout_s)
             elif item.ok is not None:
@@ -150,6 +166,8 @@ def ask(
                         if timings is not None:
                             on_timings(timings)
                     yield reply
+        if silent and silence is not None:
+            yield silence(known)
     finally:
         stopped.cancel()
 
@@ -230,52 +248,47 @@ def _remote_error(error: zenoh.ReplyError, key: str, timeout_s: float) -> Palpat
     )
 
 
-def first_reply(replies: Iterator[R | PalpateError], silence: Callable[[], PalpateError]) -> R:
+def first_reply(replies: Iterator[R | PalpateError]) -> R:
     """The first reply that is no error; further ones are not waited for.
 
     Raises:
-        PalpateError: All replies are errors; the first of them. Or that of ``silence``: there is
-            no reply at all.
+        PalpateError: All replies are errors; the first of them.
     """
     errors: list[PalpateError] = []
     for reply in replies:
         if not isinstance(reply, PalpateError):
             return reply
         errors.append(reply)
-    raise errors[0] if errors else silence()
+    raise errors[0]
 
 
-def raise_errors(
-    replies: Iterator[R | PalpateError], silence: Callable[[], PalpateError]
-) -> Iterator[R]:
-    """The same replies; an error is raised, and so is their absence.
+def raise_errors(replies: Iterator[R | PalpateError]) -> Iterator[R]:
+    """The same replies; an error is raised.
 
     Raises:
-        PalpateError: A reply is an error. Or that of ``silence``: there is no reply at all.
+        PalpateError: A reply is an error.
     """
-    silent = True
     for reply in replies:
-        silent = False
         if isinstance(reply, PalpateError):
             raise reply
         yield reply
-    if silent:
-        raise silence()
 
 
-def no_reply(session: zenoh.Session, key: str, *, roles: bool = False) -> LinkError:
+def no_reply(session: zenoh.Session, key: str, known: bool, *, roles: bool = False) -> LinkError:
     """The error for a question that had no reply at all: nobody serves it, or the reply was lost.
 
-    Zenoh tells neither; whether somebody serves the key is looked up here. With ``roles`` the
-    question may also have been refused on its way, of which Zenoh does not tell either.
+    Zenoh tells neither. If nobody was ``known`` to serve the key when it was asked, that is looked
+    up once more here. With ``roles`` the question may also have been refused on its way, of which
+    Zenoh does not tell either.
     """
-    if roles and _served(session, key):
+    served = known or is_served(session, key, LOOK_S)
+    if roles and served:
         return LinkError(
             f"{key} is served, but no answer arrived: the role of this certificate may not ask it, "
             f"it ended while it worked on the question, or its answer is {_DROPPED}",
             remedy="docs/security.md lists what each role may ask; palpate certs show tells yours",
         )
-    if _served(session, key):
+    if served:
         return LinkError(
             f"{key} is served, but no answer arrived: it ended while it worked on the question, "
             f"or its answer is {_DROPPED}",
@@ -287,18 +300,21 @@ def no_reply(session: zenoh.Session, key: str, *, roles: bool = False) -> LinkEr
     )
 
 
-def _served(session: zenoh.Session, key: str) -> bool:
+def is_served(session: zenoh.Session, key: str, wait_s: float) -> bool:
+    """Whether somebody is known to serve the key; if not, that is waited for."""
     if "*" in key:  # Zenoh does not tell
         return False
+    end_s = time.monotonic() + wait_s
+    cancellation = Cancellation.current()
     querier = session.declare_querier(key, target=zenoh.QueryTarget.ALL)
     try:
-        end_s = time.monotonic() + _LOOK_S
         while True:
             status: Any = querier.matching_status  # stub says bool, 1.10 gives a status object
             if getattr(status, "matching", status):
                 return True
-            if time.monotonic() >= end_s:
+            cancelled = cancellation is not None and cancellation.cancelled.is_set()
+            if cancelled or time.monotonic() >= end_s:
                 return False
-            time.sleep(0.002)
+            _pause(_POLL_S)
     finally:
         querier.undeclare()
