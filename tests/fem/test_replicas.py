@@ -150,6 +150,31 @@ def test_what_one_does_not_finish_another_does(own_bus: LinkConfig, fault: signa
             os.killpg(replicas[victim].pid, signal.SIGCONT)
 
 
+def test_another_whose_link_comes_back_takes_over(
+    own_bus: LinkConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with contextlib.ExitStack() as stack:
+        replicas = {name: stack.enter_context(child(own_bus, name)) for name in ("fem-a", "fem-b")}
+        robot = stack.enter_context(Client(own_bus.connect[0], timeout_s=10))
+        asked = Asked(robot, "both cut off")
+        assert asked.begun.wait(PATIENCE_S)
+        until(lambda: any(busy(robot, name) for name in replicas))
+        (victim,) = (name for name in replicas if busy(robot, name))
+        known = Session.holders
+        looks: list[object] = []
+
+        def holders(session: Session, *of: str) -> object:
+            looks.append(of)
+            return known(session, *of) if len(looks) > 3 else ()
+
+        monkeypatch.setattr(Session, "holders", holders)
+        os.killpg(replicas[victim].pid, signal.SIGKILL)
+        reply = asked.wait()
+        assert isinstance(reply, SimulationReply), reply
+        assert len(looks) > 3
+        assert asked.steps == list(range(STEPS))
+
+
 def test_the_last_one_that_dies_ends_the_question_with_a_typed_error(own_bus: LinkConfig) -> None:
     with contextlib.ExitStack() as stack:
         replica = stack.enter_context(child(own_bus, "fem-a"))

@@ -68,6 +68,11 @@ def straight_path(
     )
 
 
+_COMES_BACK_S, _POLL_S = 2.0, 0.05
+"""How long another service is waited for where one was lost, as what cut that one off may have cut
+off both, and how often it is looked for [s]."""
+
+
 def ask_simulation(
     session: Session,
     request: SimulationRequest,
@@ -85,7 +90,8 @@ def ask_simulation(
 
     The answer of a service that is killed, stopped or cut off ends, at the latest after the lease
     of its link (2 s); then another one is asked, and also when one has no room. When none is left,
-    the error of the last one is raised.
+    the error of the last one is raised; if that one was lost, after two seconds in which the link
+    of another one may come back.
 
     Raises:
         LinkError: No finite-element service runs.
@@ -103,7 +109,9 @@ def ask_simulation(
     error: PalpateError | None = None
     with session.caller_token(request.request_id):
         while True:
-            replica = _next_replica(session, sensor, asked)
+            was_lost = error is not None and not isinstance(error, RemoteError)
+            patience_s = min(_COMES_BACK_S, end_s - time.monotonic()) if was_lost else 0.0
+            replica = _next_replica(session, sensor, asked, patience_s)
             left_s = end_s - time.monotonic()
             if error is not None and (replica is None or left_s <= 0.0):
                 raise error
@@ -125,11 +133,18 @@ def ask_simulation(
                 error = failure
 
 
-def _next_replica(session: Session, sensor: str, asked: set[str]) -> str | None:
-    """A service that answers for ``sensor`` and is not in ``asked``, by chance; it is added."""
-    left = {one.instance for one in session.holders(duty_root("simulate"), sensor)} - asked
-    if not left:
-        return None
+def _next_replica(session: Session, sensor: str, asked: set[str], patience_s: float) -> str | None:
+    """A service that answers for ``sensor`` and is not in ``asked``, by chance; it is added.
+
+    If there is none, it is waited for as long as it may.
+    """
+    end_s = time.monotonic() + patience_s
+    while not (
+        left := {one.instance for one in session.holders(duty_root("simulate"), sensor)} - asked
+    ):
+        if time.monotonic() >= end_s:
+            return None
+        time.sleep(_POLL_S)
     chosen = random.choice(sorted(left))
     asked.add(chosen)
     return chosen
