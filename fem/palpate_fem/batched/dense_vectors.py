@@ -151,12 +151,12 @@ _SMALL_FRONT = """
     stored* half_here = half.data + (size_t(base) + first_row) * 2;
 #ifdef __CUDA_ARCH__
     constexpr int threads = WP_TILE_BLOCK_DIM, warps = threads / 32;
-    __shared__ __align__(16) stored vector[(SMALL + 1) * 64], other[INVERTED * 64];
+    __shared__ __align__(16) stored vector[SMALL * 64], other[INVERTED * 64];
 #else
     if (thread > 0)
         return;
     constexpr int threads = 1;
-    stored vector[(SMALL + 1) * 64], other[INVERTED * 64];
+    stored vector[SMALL * 64], other[INVERTED * 64];
 #endif
 """.replace("SMALL", str(SMALL)).replace("INVERTED", str(INVERTED))
 
@@ -316,9 +316,8 @@ def solve_small_rows(
 ):
     """What `gather_loads` and `solve_rows` do, for one small front and by one block of threads.
 
-    Results do not depend on how many these are.
     The children are those of `FrontTiles`, from ``child`` on; ``first_row`` is the front's first
-    row in a vector, and ``base`` the slot's.
+    row in a vector, and ``base`` the slot's. Blocks of any size find the same bits.
     """
     ...
 

@@ -318,12 +318,6 @@ def add_viscosity(
 
 
 @wp.kernel
-def clear_sums(listed: wp.array(dtype=wp.int32), sums_out: wp.array(dtype=wp.float64)):
-    """Set the sums of the listed slots to zero."""
-    sums_out[listed[wp.tid()]] = wp.float64(0.0)
-
-
-@wp.kernel
 def add_products(
     listed: wp.array(dtype=wp.int32),
     first_in: wp.array3d(dtype=wp.float64),

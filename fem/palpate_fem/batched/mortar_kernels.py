@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from palpate_fem.batched.dense_tiles import THREADS
 from palpate_fem.indenter.kernels import indenter_distance
 from palpate_fem.mechanics.contact_kernels import at_point, core_distance, grid_cell
 
@@ -99,7 +100,7 @@ def add_to_means(
         wp.atomic_add(mean_out, begin + faces[s, a], weight[s, q, a] * gap)
 
 
-@wp.kernel(launch_bounds=(256, 3))
+@wp.kernel(launch_bounds=(THREADS, 3))
 def mean_gaps_to_indenter(
     faces: wp.array2d(dtype=wp.int32),
     shape: wp.array2d(dtype=wp.float64),

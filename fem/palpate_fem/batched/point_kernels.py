@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from palpate_fem.batched.dense_tiles import THREADS
 from palpate_fem.mechanics.element_kernels import (
     Scales,
     deformation,
@@ -67,7 +68,7 @@ def smallest_of_element(value: wp.float64) -> wp.float64:
     ...
 
 
-@wp.kernel(launch_bounds=(256, 2))
+@wp.kernel(launch_bounds=(THREADS, 2))
 def element_state_by_point(
     elements: wp.array2d(dtype=wp.int32),
     gradient: wp.array3d(dtype=wp.vec3d),
@@ -185,7 +186,7 @@ def put_share(share: wp.mat33d, at: int, share_out: wp.array2d(dtype=Any)):
             share_out[at, 3 * i + j] = share_out.dtype(share[i, j])
 
 
-@wp.kernel(launch_bounds=(256, 3))
+@wp.kernel(launch_bounds=(THREADS, 3))
 def element_tangent_by_pair(
     pair: wp.array3d(dtype=wp.int32),
     couples: wp.array(dtype=wp.vec2i),
