@@ -296,7 +296,8 @@ def spawn(*words: object) -> subprocess.Popen[str]:
     )
 
 
-def test_ctrl_c_keeps_what_has_ended(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_sweep_keeps_what_has_ended(stop: signal.Signals, tmp_path: Path) -> None:
     store = tmp_path / "a.sim"
     process = spawn(
         "run", "--sweep", "--indenter", "cube", "--steps", 5, "--store", store, "--friction",
@@ -306,11 +307,14 @@ def test_ctrl_c_keeps_what_has_ended(tmp_path: Path) -> None:
     while len(list(store.rglob("normal.h5"))) < 1:
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers, too
+    # To the workers, too, as a terminal, `timeout` and a cluster's scheduler do.
+    os.killpg(process.pid, stop)
     output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
     assert "the same command goes on" in output
+    assert "failed" not in output
     assert "Traceback" not in errors
+    assert "ended by" not in errors
     assert SimulationStore.open(store).check() >= 1
 
 

@@ -265,5 +265,8 @@ def channel_to_parent() -> Channel:
     # Libraries print remarks to stdout, but a command's stdout may be JSON for machines.
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     faulthandler.enable()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started us handles Ctrl-C
+    # Whoever stops a command may signal its whole group. The process that started us handles that;
+    # we end when it does.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     return Channel(int(sys.argv[1]))
