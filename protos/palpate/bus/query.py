@@ -131,6 +131,7 @@ def ask(
     if cancellation is not None:
         cancellation.watch(stopped)
     target = zenoh.QueryTarget.ALL if everyone else zenoh.QueryTarget.BEST_MATCHING
+    known = False
     try:
         known = is_served(session, key, min(settle_s, timeout_s / 2))
         left_s = max(end_s - time.monotonic(), _LEAST_S)
@@ -146,7 +147,10 @@ def ask(
             cancellation_token=stopped,
         )
     except zenoh.ZError as error:
-        raise LinkError(f"cannot ask {key}: {error}", remedy="open the session again") from error
+        if cancellation is None or not cancellation.cancelled.is_set():
+            problem = f"cannot ask {key}: {error}"
+            raise LinkError(problem, remedy="open the session again") from error
+        replies.put(None)  # cancelled before it was sent: there is no reply
     silent = True
     try:
         while (item := replies.get()) is not None:
