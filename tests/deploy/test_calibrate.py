@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -18,10 +16,9 @@ import palpate_training
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig
-from palpate.errors import LinkError
 from palpate.files.bundle import read_bundle
 from palpate.messages import QualityFlag
-from palpate_deploy.station import calibrate, guided_presses
+from palpate_deploy.station import calibrate
 from palpate_deploy.station.guided_presses import HELD_S, PressCounter
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
@@ -68,25 +65,6 @@ def count(*readings: tuple[float, float]) -> tuple[int, float]:
 
 def test_the_command_wants_as_many_presses_as_the_training() -> None:
     assert calibrate.PRESSES_LEAST == finger.PRESSES_LEAST
-
-
-def test_a_tare_whose_answer_was_lost_is_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    tare = MagicMock()
-
-    def ask(*_: object, **__: object) -> object:
-        asked.append("")
-        if len(asked) < 3:
-            raise LinkError("no answer arrived", remedy="ask again")
-        return tare
-
-    monkeypatch.setattr(guided_presses, "ask_tare", ask)
-    monkeypatch.setattr(guided_presses, "_AGAIN_S", 0.0)
-    assert guided_presses._tare(MagicMock(), "finger", threading.Event()) is tare
-    monkeypatch.setattr(guided_presses, "_LET_GO_S", 0.0)
-    asked.clear()
-    with pytest.raises(LinkError):
-        guided_presses._tare(MagicMock(), "finger", threading.Event())
 
 
 class TestPresses:

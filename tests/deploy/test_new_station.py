@@ -8,6 +8,7 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,6 +23,7 @@ from typer.testing import CliRunner
 from palpate.errors import ConfigError, LinkError, StreamTimeout
 from palpate_deploy.cli.app import app
 from palpate_deploy.station import first_hour, new_station
+from palpate_deploy.station import tare as tare_module
 from palpate_deploy.station.profile import load_profile
 from palpate_gateway.emulators.biotac_can import BiotacCanEmulator
 from palpate_gateway.emulators.kms40 import Kms40Emulator
@@ -463,7 +465,7 @@ class TestZero:
     def test_never_let_go(
         self, tare: Any, bench: Callable[[list[float]], Any], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(first_hour, "_LET_GO_S", 0.2)
+        monkeypatch.setattr(first_hour, "LET_GO_S", 0.2)
         session, _ = bench([2900.0] * 100_000)
         with pytest.raises(StreamTimeout, match="was touched for"):
             first_hour.zero_wrench(session, tare)
@@ -481,10 +483,12 @@ def test_a_session_that_does_not_know_yet_who_answers_asks_again(
             raise LinkError("no service answers", remedy="start the service")
         return tare
 
-    monkeypatch.setattr(first_hour, "ask_tare", ask)
-    monkeypatch.setattr(first_hour, "_AGAIN_S", 0.0)
-    assert first_hour.tare_finger(MagicMock()) is tare
-    monkeypatch.setattr(first_hour, "_LET_GO_S", 0.0)
+    def tare_at_rest() -> object:
+        return tare_module.tare_at_rest(MagicMock(), "finger", threading.Event(), again_s=0.0)
+
+    monkeypatch.setattr(tare_module, "ask_tare", ask)
+    assert tare_at_rest() is tare
+    monkeypatch.setattr(tare_module, "LET_GO_S", 0.0)
     asked.clear()
     with pytest.raises(LinkError):
-        first_hour.tare_finger(MagicMock())
+        tare_at_rest()

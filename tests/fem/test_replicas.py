@@ -125,18 +125,25 @@ def busy(robot: Client, instance: str) -> bool:
     )
 
 
-@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
-def test_what_one_does_not_finish_another_does(own_bus: LinkConfig, fault: signal.Signals) -> None:
-    """The caller sees each step once, and a whole answer."""
+@contextlib.contextmanager
+def two_with_a_question(bus: LinkConfig) -> Iterator[tuple[int, Client, Asked]]:
+    """Two replicas and a question: the process id of that which works on it, its caller, and it."""
     with contextlib.ExitStack() as stack:
-        replicas = {name: stack.enter_context(child(own_bus, name)) for name in ("fem-a", "fem-b")}
-        robot = stack.enter_context(Client(own_bus.connect[0], timeout_s=10))
+        replicas = {name: stack.enter_context(child(bus, name)) for name in ("fem-a", "fem-b")}
+        robot = stack.enter_context(Client(bus.connect[0], timeout_s=10))
         asked = Asked(robot, "failover")
         assert asked.begun.wait(PATIENCE_S)
         until(lambda: any(busy(robot, name) for name in replicas))
         (victim,) = (name for name in replicas if busy(robot, name))
+        yield replicas[victim].pid, robot, asked
+
+
+@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
+def test_what_one_does_not_finish_another_does(own_bus: LinkConfig, fault: signal.Signals) -> None:
+    """The caller sees each step once, and a whole answer."""
+    with two_with_a_question(own_bus) as (victim, robot, asked):
         # Its workers go with it: it is the process that is lost, or the whole host that stops.
-        os.killpg(replicas[victim].pid, fault)
+        os.killpg(victim, fault)
         reply = asked.wait()
         assert isinstance(reply, SimulationReply), reply
         assert reply.outcome is SimulationOutcome.COMPLETE
@@ -147,19 +154,13 @@ def test_what_one_does_not_finish_another_does(own_bus: LinkConfig, fault: signa
         assert again.outcome is SimulationOutcome.COMPLETE
         assert time.monotonic() - began_s < PATIENCE_S
         if fault == signal.SIGSTOP:
-            os.killpg(replicas[victim].pid, signal.SIGCONT)
+            os.killpg(victim, signal.SIGCONT)
 
 
 def test_another_whose_link_comes_back_takes_over(
     own_bus: LinkConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with contextlib.ExitStack() as stack:
-        replicas = {name: stack.enter_context(child(own_bus, name)) for name in ("fem-a", "fem-b")}
-        robot = stack.enter_context(Client(own_bus.connect[0], timeout_s=10))
-        asked = Asked(robot, "both cut off")
-        assert asked.begun.wait(PATIENCE_S)
-        until(lambda: any(busy(robot, name) for name in replicas))
-        (victim,) = (name for name in replicas if busy(robot, name))
+    with two_with_a_question(own_bus) as (victim, _, asked):
         known = Session.holders
         looks: list[object] = []
 
@@ -168,7 +169,7 @@ def test_another_whose_link_comes_back_takes_over(
             return known(session, *of) if len(looks) > 3 else ()
 
         monkeypatch.setattr(Session, "holders", holders)
-        os.killpg(replicas[victim].pid, signal.SIGKILL)
+        os.killpg(victim, signal.SIGKILL)
         reply = asked.wait()
         assert isinstance(reply, SimulationReply), reply
         assert len(looks) > 3

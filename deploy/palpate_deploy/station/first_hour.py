@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from rich.table import Table
 from palpate.admin import read_token, token_file
 from palpate.bus import Delivery, Session, Subscriber
 from palpate.bus.topics import ELECTRODES, FEATURES, POSE, WRENCH, Topic
-from palpate.client.estimates import ask_tare, ask_zero
+from palpate.client.estimates import ask_zero
 from palpate.client.models import ModelAdmin
 from palpate.config import Role
 from palpate.errors import LinkError, RemoteError, StreamTimeout, printable
@@ -41,13 +42,11 @@ from palpate_deploy.station.logs import cell
 from palpate_deploy.station.new_station import FINGER, WRENCH_SENSOR
 from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import Profile, load_profile
+from palpate_deploy.station.tare import LET_GO_S, tare_at_rest
 
 _JOIN_S = 0.5
 _READY_S = 60.0
 _POLL_S = 0.1
-
-_LET_GO_S = 60.0
-"""How long is waited until nobody touches the finger [s]."""
 
 _ASK_S = 10.0
 _AGAIN_S = 0.2
@@ -96,7 +95,8 @@ def walk(order: WalkOrder) -> None:
     with _running(profile, console) as run:
         with join(profile, wait_s=_READY_S, role=Role.OPERATOR) as session:
             console.print("tare: let go of the finger", markup=False)
-            tare = tare_finger(session)
+            tare = tare_at_rest(session, FINGER, threading.Event(), again_s=_AGAIN_S)
+            assert tare is not None, "nothing interrupts it"
             if any(sensor.name == WRENCH_SENSOR for sensor in profile.gateway.sensors):
                 zero_wrench(session, tare)
             console.print(
@@ -178,24 +178,6 @@ def _wait_ready(profile: Profile, run: FiniteRun) -> None:
     )
 
 
-def tare_finger(session: Session) -> Tare:
-    """Tare the finger as soon as nobody touches it.
-
-    Raises:
-        RemoteError: It is touched for a minute.
-        LinkError: Nobody answers for a minute; a session that has just joined may not know yet who
-            does.
-    """
-    until = time.monotonic() + _LET_GO_S
-    while True:
-        try:
-            return ask_tare(session, FINGER, frames=0, timeout_s=_ASK_S)
-        except (RemoteError, LinkError):
-            if time.monotonic() >= until:
-                raise
-            time.sleep(_AGAIN_S)
-
-
 def zero_wrench(session: Session, tare: Tare) -> None:
     """Zero the force/torque sensor while the tared finger shows that nothing touches it.
 
@@ -205,7 +187,7 @@ def zero_wrench(session: Session, tare: Tare) -> None:
         RemoteError: The gateway refuses for a minute.
         StreamTimeout: The finger is touched for a minute, or sends nothing.
     """
-    until = time.monotonic() + _LET_GO_S
+    until = time.monotonic() + LET_GO_S
     refused: RemoteError | None = None
     with session.subscriber(ELECTRODES, sensor=FINGER, delivery=Delivery.QUEUE) as frames:
         while time.monotonic() < until:
@@ -226,7 +208,7 @@ def zero_wrench(session: Session, tare: Tare) -> None:
             if seen and not any(touched(frame, tare) for frame in seen):
                 return
     raise refused or StreamTimeout(
-        f"the finger was touched for {_LET_GO_S:g} s",
+        f"the finger was touched for {LET_GO_S:g} s",
         remedy="leave it untouched, and tare it again if its baseline is wrong: palpate tare",
     )
 

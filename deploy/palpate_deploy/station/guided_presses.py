@@ -18,11 +18,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import ELECTRODES, WRENCH, Topic
-from palpate.client.estimates import ask_tare
 from palpate.config import LinkConfig, parse_config
-from palpate.errors import LinkError, RecordingError, RemoteError, StreamTimeout
+from palpate.errors import LinkError, RecordingError, StreamTimeout
 from palpate.messages import Tare
 from palpate.process import stop_on_signals
+from palpate_deploy.station.tare import tare_at_rest
 from palpate_services.config import EVERYTHING, RecorderConfig
 from palpate_services.recorder.service import run_recorder
 
@@ -54,10 +54,6 @@ HINTS = (
 _SEEN_S = 5.0
 """A stream that brings nothing for this long is not there [s]."""
 
-_LET_GO_S = 60.0
-"""How long is waited until nobody touches the finger [s]."""
-
-_TARE_S = 10.0
 _LINE_S = 2.0
 _AGAIN_S = 0.5
 
@@ -99,7 +95,7 @@ def untouched(link: LinkConfig, station: str, sensor: str, console: Console) -> 
     with Session.open(link, station=station) as session:
         _first(session, ELECTRODES, sensor, _NO_ELECTRODES)
         console.print("let go of the finger: it is tared", markup=False)
-        tare = _tare(session, sensor, threading.Event())
+        tare = tare_at_rest(session, sensor, threading.Event(), again_s=_AGAIN_S)
         assert tare is not None, "nothing interrupts it"
         return tare
 
@@ -140,7 +136,7 @@ def record_presses(
         _first(session, WRENCH, sensor, no_force)
         with _recording(link, station, sensor, out) as recording:
             console.print("let go of the finger: it is tared", markup=False)
-            _tare(session, sensor, interrupted)
+            tare_at_rest(session, sensor, interrupted, again_s=_AGAIN_S)
             if not interrupted.is_set():
                 _guide(session, sensor, presses, out, interrupted, console, check=recording.check)
         return recording.path()
@@ -218,22 +214,6 @@ def _recording(link: LinkConfig, station: str, sensor: str, out: Path) -> Iterat
     finally:
         stop.set()
         thread.join()
-
-
-def _tare(session: Session, sensor: str, interrupted: threading.Event) -> Tare | None:
-    """Tare the finger as soon as nobody touches it; None = interrupted.
-
-    Where no answer came it is asked for again: that it may be tared twice does no harm.
-    """
-    give_up_s = time.monotonic() + _LET_GO_S
-    while not interrupted.is_set():
-        try:
-            return ask_tare(session, sensor, frames=0, timeout_s=_TARE_S)
-        except (LinkError, RemoteError):  # the answer was lost, or the finger is touched
-            if time.monotonic() >= give_up_s:
-                raise
-            interrupted.wait(_AGAIN_S)
-    return None
 
 
 def _guide(

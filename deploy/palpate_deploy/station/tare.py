@@ -1,14 +1,22 @@
-"""``palpate tare``: the present load of a sensor as its zero."""
+"""The present load of a sensor as its zero: ``palpate tare``, and guided work with a finger."""
 
 from __future__ import annotations
+
+import threading
+import time
 
 import numpy as np
 
 from palpate.bus import Session, endpoints
 from palpate.client.estimates import ask_tare, ask_zero
 from palpate.config import LinkConfig
-from palpate.errors import LinkError, printable
+from palpate.errors import LinkError, RemoteError, printable
 from palpate.messages import FloatArray, Tare, WrenchZero
+
+LET_GO_S = 60.0
+"""How long is waited until nobody touches a finger [s]."""
+
+_ASK_S = 10.0
 
 
 def take_tare(
@@ -22,20 +30,51 @@ def take_tare(
         StreamTimeout: It does not answer in time.
     """
     with Session.open(link, station=station) as session:
+
+        def zero() -> None:
+            _print_zero(sensor, ask_zero(session, sensor, readings=frames, timeout_s=timeout_s))
+
         # A force/torque sensor has a zero instead of a tare.
         if session.serves(endpoints.ZERO, sensor=sensor):
-            _print_zero(sensor, ask_zero(session, sensor, readings=frames, timeout_s=timeout_s))
+            zero()
             return
         try:
             tare = ask_tare(session, sensor, frames=frames, timeout_s=timeout_s)
         except LinkError as not_found:
             try:
-                zero = ask_zero(session, sensor, readings=frames, timeout_s=timeout_s)
+                zero()
             except LinkError:
                 raise not_found from None
-            _print_zero(sensor, zero)
         else:
             _print_tare(sensor, tare)
+
+
+def tare_at_rest(
+    session: Session, sensor: str, interrupted: threading.Event, *, again_s: float
+) -> Tare | None:
+    """Tare a finger as soon as nobody touches it; None = interrupted.
+
+    Where no answer came it is asked for again: that it may be tared twice does no harm.
+
+    Args:
+        session: An open session.
+        sensor: Name of the finger.
+        interrupted: Ends the waiting.
+        again_s: Time from a refusal, or a question without an answer, to the next one [s].
+
+    Raises:
+        RemoteError: It is touched for a minute.
+        LinkError: Nobody answers for a minute.
+    """
+    give_up_s = time.monotonic() + LET_GO_S
+    while not interrupted.is_set():
+        try:
+            return ask_tare(session, sensor, frames=0, timeout_s=_ASK_S)
+        except (LinkError, RemoteError):
+            if time.monotonic() >= give_up_s:
+                raise
+            interrupted.wait(again_s)
+    return None
 
 
 def _print_tare(sensor: str, tare: Tare) -> None:

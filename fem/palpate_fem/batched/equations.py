@@ -165,6 +165,11 @@ class BatchedEquations:
             items(kernels.expand, self.inner.count),
         )
 
+    def clear(self, listed: Listed, each: int, array: wp.array) -> None:
+        """Set ``each`` numbers of every listed slot to zero."""
+        dim = (len(listed.slots), kernels.threads_for(each))
+        self._launch(kernels.clear_rows, dim, [listed.slots, each], [self._flat(array)])
+
     def pose(self, slots: Ints, kind: Ints, tip: Floats, rotation: Floats) -> None:
         """Put indenters: their kinds (m,), tips [m], (m, 3), and rotations (m, 3, 3)."""
         arrays = self._kind, self._tip, self._rotation
@@ -229,7 +234,7 @@ class BatchedEquations:
     def _skin_forces(self, state: BatchedState, listed: Listed) -> None:
         """Evaluate the forces of the skin, and the cavity's volume."""
         for field in (self._internal, self._gradient_of_volume):
-            self._clear(listed, 3 * self._nodes, field)
+            self.clear(listed, 3 * self._nodes, field)
         inner = self.inner
         results = [self._volume, self._jacobian, self._volume_gradient, self._internal]
         place = [listed.elements, state.position, state.pressure]
@@ -254,7 +259,7 @@ class BatchedEquations:
         """Evaluate the forces of indenter and core."""
         outer, inner = self.outer, self.inner
         for field in (outer.force, inner.force):
-            self._clear(listed, 3 * self._nodes, field)
+            self.clear(listed, 3 * self._nodes, field)
         posed = [self._primitives, self._kind]
         place = [self._tip, self._rotation, self._nodes, listed.outer]
         self._launch(
@@ -430,7 +435,7 @@ class BatchedEquations:
         """Subtract `EquilibriumSystem.unsymmetric_product` of a change of the free unknowns."""
         moved = self._as_field(listed, change, of)
         field, outer = self._product, self.outer
-        self._clear(listed, 3 * self._nodes, field)
+        self.clear(listed, 3 * self._nodes, field)
         self._launch(
             contact_kernels.unsymmetric_product,
             len(listed.outer),
@@ -456,9 +461,9 @@ class BatchedEquations:
         How the offsets change is kept for `targets`.
         """
         moved, field = self._as_field(listed, change, of), self._product
-        self._clear(listed, 3 * self._nodes, field)
+        self.clear(listed, 3 * self._nodes, field)
         for surface, items in self._mortar_surfaces(listed):
-            self._clear(listed, self._nodes, surface.offset_change)
+            self.clear(listed, self._nodes, surface.offset_change)
             surface.add_offset_changes(items, self._margin, moved)
             surface.add_offset_load(items, field)
         self._gather_load(listed, -1.0, field, vectors, lane, add=True)
@@ -601,13 +606,8 @@ class BatchedEquations:
             self._flattened[array.ptr] = array.flatten() if array.dtype is wp.int32 else flat(array)
         return self._flattened[array.ptr]
 
-    def _clear(self, listed: Listed, each: int, array: wp.array) -> None:
-        """Set ``each`` numbers of every listed slot to zero."""
-        dim = (len(listed.slots), kernels.threads_for(each))
-        self._launch(kernels.clear_rows, dim, [listed.slots, each], [self._flat(array)])
-
     def _cleared_field(self, listed: Listed) -> wp.array:
-        self._clear(listed, 3 * self._nodes, self._field)
+        self.clear(listed, 3 * self._nodes, self._field)
         return self._field
 
     def _as_field(self, listed: Listed, vectors: wp.array, lane: int) -> wp.array:

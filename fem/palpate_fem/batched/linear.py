@@ -156,7 +156,7 @@ class BatchedLinearSystem:
         out: wp.array,
     ) -> None:
         count, device = len(listed.numbers), self.equations.device
-        self._launch(kernels.clear_rows, (count, 1), [listed.slots, 1], [out])
+        self.equations.clear(listed, 1, out)
         parts = -(-self._size // kernels.STRETCH)
         wp.launch_tiled(
             kernels.add_products,

@@ -1,11 +1,11 @@
 # mypy: ignore-errors
 """Sums and extremes over the nodes, elements and faces of each slot: numbers that the host reads.
 
-Those of a balance, and those of a step of the solution. In the former, of which there are many, a
-thread has one node, element or face; the threads of a warp find their sum or extreme together, and
-one of them adds it to the slot's. (With an atomic operation of each thread, the thousands of a slot
-wait for each other.) So all threads of a warp belong to one slot: launches have `padded` threads
-for each.
+A balance is evaluated in every iteration. There a thread has one node, element or face; the threads
+of a warp find their sum or extreme together, and one of them adds it to the slot's. (With an atomic
+operation of each thread, the thousands of a slot wait for each other.) So all threads of a warp
+belong to one slot: launches have `padded` threads for each. Steps of the solution are rare: there
+each thread adds its own.
 """
 
 from __future__ import annotations

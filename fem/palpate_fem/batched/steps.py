@@ -114,8 +114,7 @@ class BatchedSteps:
         """Sums of the listed slots."""
         outer, inner = self._equations.outer, self._equations.inner
         slots, count, sums = listed.slots, len(listed.slots), [self._sums]
-        dim = (count, kernels.threads_for(SUMS))
-        self._launch(kernels.clear_rows, dim, [slots, SUMS], [flat(self._sums)])
+        self._equations.clear(listed, SUMS, self._sums)
         self._launch(
             reductions.sum_forces,
             (count, self._nodes),
