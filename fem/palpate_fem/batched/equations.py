@@ -120,7 +120,7 @@ class BatchedEquations:
             self._core = [
                 numbers(core.coefficients), wp.vec3d(*core.origin), wp.float64(core.spacing)
             ]  # fmt: skip
-            self._core_margin = wp.float64(system.contact.margin_m + 2 * core.spacing)
+            self._core_margin = wp.float64(core.cell_margin_m)
         self._margin = wp.float64(system.contact.margin_m)
         self._numbers = room(wp.float64, slots, reductions.NUMBERS)
         self._longest = room(wp.float64, slots, 1)

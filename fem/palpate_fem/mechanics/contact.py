@@ -415,9 +415,7 @@ class CoreContact:
         self.force = np.zeros((nodes, 3))
         self._force = vec3s(self.force)
         self._table = scalars(core.coefficients if core else np.zeros((4, 4, 4)))
-        # The kernels first look at one coefficient of the point's cell, whose node is up to sqrt(3)
-        # spacings away from the point.
-        self._margin = wp.float64(settings.margin_m + (2 * core.spacing if core else 0.0))
+        self._margin = wp.float64(core.cell_margin_m if core else 0.0)
 
     def evaluate(self, state: SolutionState, position: wp.array) -> None:
         """Evaluate minus the nodal forces on the skin, and the results at each point."""

@@ -497,8 +497,8 @@ def core_contact(
 ):
     """Frictionless contact of the inner faces with the core, whose distance is a cubic B-spline.
 
-    Adds minus the contact force to ``force_out``. Points in a cell whose coefficient exceeds
-    ``margin`` are skipped.
+    Adds minus the contact force to ``force_out``. The coefficient of a point's cell is within
+    ``margin`` of its distance; points that cannot touch by it have that for a distance.
     """
     item, q = wp.tid()
     f = items[item]
@@ -514,7 +514,7 @@ def core_contact(
         slope_out[f, q] = wp.vec3d()
         misfit_out[f, q] = wp.vec3d()
     p = pressure_in[f, q]
-    if rough < margin or p > wp.float64(0.0):
+    if rough + correction_in[f, q] < margin or p > wp.float64(0.0):
         near = core_distance(coefficients, origin, spacing, x)
         gap = near.gap + correction_in[f, q]
         gap_out[f, q] = gap

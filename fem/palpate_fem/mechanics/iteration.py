@@ -17,8 +17,11 @@ from palpate.errors import SimulationError
 DAMP_FROM = 6
 """Iterations after which an error that does not decrease is taken for a cycle."""
 
-MORTAR_FROM = 1e-2
+MORTAR_FROM = 0.1
 """Error from which on the mortar correction is evaluated again: near enough to the solution."""
+
+CONTINUED_MORTAR_FROM = 1e-2
+"""The same of continuation, which evaluates it a few times only."""
 
 RENEWALS = 6
 """Iterations that evaluate it, one after another; if they do not end, it is kept in between."""
@@ -272,13 +275,14 @@ def newton_iterations(
     limit = settings.pseudo_transient_iterations if continuation else settings.iterations
     fits, elastic = False, not (has_elastic and settings.keep_elastic)
     most = min(settings.mortar_updates, CONTINUED_UPDATES if continuation else limit)
+    near = CONTINUED_MORTAR_FROM if continuation else MORTAR_FROM
     updates, done = 0, 0  # of the mortar correction, and the iterations before it was asked for
     renews, renewals = False, 0
     found, error = start, largest_error(start, volume)
     report.residuals.append(error)
     while True:
         moved = report.iterations > done
-        if moved and updates < most and not renews and error < MORTAR_FROM:
+        if moved and updates < most and not renews and error < near:
             found, changed = cast("Evaluated", (yield Correct()))
             error = largest_error(found, volume)
             updates, done = updates + 1, report.iterations
@@ -311,9 +315,9 @@ def newton_iterations(
             report.reason = "the equations gave no number"
             return found
         # The active set of contact changes from one iteration to the next, the skin's own tangent
-        # little within an increment: it is evaluated again after the first iteration, which brings
-        # the state near, and then only where convergence is slow.
-        elastic = report.iterations == 1 or error > settings.keep_elastic * before
+        # little within an increment: it is evaluated again after the second iteration, where many
+        # increments need no further factor, else only where convergence is slow.
+        elastic = report.iterations == 2 or error > settings.keep_elastic * before
         fits = error < settings.keep_factor * before and not changed
         if continuation:
             continuation.after(found.residual)

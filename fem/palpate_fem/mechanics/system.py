@@ -197,12 +197,12 @@ class EquilibriumSystem:
         def first_half() -> None:
             self._forces[0][:] = 0.0
             self.skin.add_forces(self._halves[0], position, pressure, self._force_arrays[0])
+            self._cavity.evaluate(position)
             self.on_indenter.evaluate(state, indenter, position)
 
         def second_half() -> None:
             self._forces[1][:] = 0.0
             self.skin.add_forces(self._halves[1], position, pressure, self._force_arrays[1])
-            self._cavity.evaluate(position)
             self.on_core.evaluate(state, position)
 
         self._both(first_half, second_half)
