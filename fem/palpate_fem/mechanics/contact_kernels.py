@@ -497,8 +497,8 @@ def core_contact(
 ):
     """Frictionless contact of the inner faces with the core, whose distance is a cubic B-spline.
 
-    Adds minus the contact force to ``force_out``. The coefficient of a point's cell is within
-    ``margin`` of its distance; points that cannot touch by it have that for a distance.
+    Adds minus the contact force to ``force_out``. The coefficient of a point's cell is its distance
+    to within ``margin``; where that shows that the point cannot touch, it is taken for the gap.
     """
     item, q = wp.tid()
     f = items[item]

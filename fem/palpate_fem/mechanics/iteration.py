@@ -315,8 +315,8 @@ def newton_iterations(
             report.reason = "the equations gave no number"
             return found
         # The active set of contact changes from one iteration to the next, the skin's own tangent
-        # little within an increment: it is evaluated again after the second iteration, where many
-        # increments need no further factor, else only where convergence is slow.
+        # little within an increment: it is evaluated again after the second iteration, when many
+        # increments need no further factor, and otherwise only where convergence is slow.
         elastic = report.iterations == 2 or error > settings.keep_elastic * before
         fits = error < settings.keep_factor * before and not changed
         if continuation:
