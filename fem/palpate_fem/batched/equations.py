@@ -120,7 +120,6 @@ class BatchedEquations:
             self._core = [
                 numbers(core.coefficients), wp.vec3d(*core.origin), wp.float64(core.spacing)
             ]  # fmt: skip
-            self._core_margin = wp.float64(core.cell_margin_m)
         self._margin = wp.float64(system.contact.margin_m)
         self._numbers = room(wp.float64, slots, reductions.NUMBERS)
         self._longest = room(wp.float64, slots, 1)
@@ -284,7 +283,7 @@ class BatchedEquations:
             self._launch(
                 contact_kernels.core_contact,
                 (len(listed.inner), inner.points),
-                [inner.faces, inner.shape, inner.area, *place, self._core_law, self._core_margin,
+                [inner.faces, inner.shape, inner.area, *place, self._core_law,
                  state.position, inner.offset, state.core_pressure],
                 [*inner.results, inner.force],
             )  # fmt: skip

@@ -10,7 +10,7 @@ import warp as wp
 
 from palpate_fem.batched.dense_tiles import THREADS
 from palpate_fem.indenter.kernels import indenter_distance
-from palpate_fem.mechanics.contact_kernels import at_point, core_distance, grid_cell
+from palpate_fem.mechanics.contact_kernels import CELL, at_point, core_distance, grid_cell
 
 wp.set_module_options({"enable_backward": False})
 
@@ -55,7 +55,7 @@ def near_core(
     normal_out: wp.array(dtype=wp.vec3d),
     mean_out: wp.array(dtype=wp.float64),
 ):
-    """`near_indenter` for the core; far from it the gap is about the coefficient of its cell."""
+    """`near_indenter` for the core; far from it the gap is the coefficient of its cell."""
     i, k = wp.tid()
     slot = slots[i]
     at = slot * nodes + surface[k]
@@ -64,7 +64,7 @@ def near_core(
     gap_out[at] = coefficients[cell[0], cell[1], cell[2]]
     normal_out[at] = wp.vec3d()
     mean_out[at] = wp.float64(0.0)
-    if gap_out[at] < margin + wp.float64(2.0) * spacing:
+    if gap_out[at] < margin + CELL * spacing:
         near = core_distance(coefficients, origin, spacing, x)
         gap_out[at] = near.gap
         normal_out[at] = near.normal

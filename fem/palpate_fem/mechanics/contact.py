@@ -415,7 +415,6 @@ class CoreContact:
         self.force = np.zeros((nodes, 3))
         self._force = vec3s(self.force)
         self._table = scalars(core.coefficients if core else np.zeros((4, 4, 4)))
-        self._margin = wp.float64(core.cell_margin_m if core else 0.0)
 
     def evaluate(self, state: SolutionState, position: wp.array) -> None:
         """Evaluate minus the nodal forces on the skin, and the results at each point."""
@@ -435,7 +434,6 @@ class CoreContact:
                 surface.nodes,
                 surface.items,
                 self.settings.law(0.0),
-                self._margin,
                 position,
                 scalars(state.on_core.gap),
                 scalars(state.core_pressure),
@@ -470,8 +468,8 @@ class CoreContact:
     def _distance(self, points: Floats) -> tuple[Floats, Floats]:
         """Distance to the core [m], (N,), and its gradient, (N, 3); see `DistanceGrid.evaluate`.
 
-        Without a margin: the means of gaps need it wherever a touching face's points are, as the
-        forces at these points do.
+        Far from the core, too: the means of gaps need it wherever a touching face's points are, as
+        the forces at these points do.
         """
         assert self.core is not None
         gap, normal = np.empty(len(points)), np.empty((len(points), 3))
@@ -482,7 +480,6 @@ class CoreContact:
                 self._table,
                 wp.vec3d(*self.core.origin),
                 wp.float64(self.core.spacing),
-                wp.float64(np.inf),
                 vec3s(np.ascontiguousarray(points)),
             ],
             [scalars(gap), vec3s(normal)],

@@ -37,6 +37,10 @@ from palpate_fem.indenter.kernels import indenter_distance
 
 wp.set_module_options({"enable_backward": False})
 
+CELL = wp.constant(wp.float64(2.0))
+"""Spacings by which the distance to the core at a point may differ from the coefficient of its
+cell, whose node is up to sqrt(3) of them away."""
+
 
 @wp.struct
 class ContactLaw:
@@ -453,23 +457,15 @@ def core_distances(
     coefficients: wp.array3d(dtype=wp.float64),
     origin: wp.vec3d,
     spacing: wp.float64,
-    margin: wp.float64,
     point_in: wp.array(dtype=wp.vec3d),
     gap_out: wp.array(dtype=wp.float64),
     normal_out: wp.array(dtype=wp.vec3d),
 ):
-    """`core_distance` at each point, but its second derivative.
-
-    Where the coefficient of a point's cell exceeds ``margin``, the gap is that, the gradient zero.
-    """
+    """`core_distance` at each point, but its second derivative."""
     i = wp.tid()
-    cell = grid_cell(coefficients, origin, spacing, point_in[i])
-    gap_out[i] = coefficients[cell[0], cell[1], cell[2]]
-    normal_out[i] = wp.vec3d()
-    if gap_out[i] < margin:
-        near = core_distance(coefficients, origin, spacing, point_in[i])
-        gap_out[i] = near.gap
-        normal_out[i] = near.normal
+    near = core_distance(coefficients, origin, spacing, point_in[i])
+    gap_out[i] = near.gap
+    normal_out[i] = near.normal
 
 
 @wp.kernel
@@ -483,7 +479,6 @@ def core_contact(
     nodes: int,
     items: wp.array(dtype=wp.int32),
     law: ContactLaw,
-    margin: wp.float64,
     position_in: wp.array(dtype=wp.vec3d),
     correction_in: wp.array2d(dtype=wp.float64),
     pressure_in: wp.array2d(dtype=wp.float64),
@@ -497,8 +492,8 @@ def core_contact(
 ):
     """Frictionless contact of the inner faces with the core, whose distance is a cubic B-spline.
 
-    Adds minus the contact force to ``force_out``. The coefficient of a point's cell is its distance
-    to within ``margin``; where that shows that the point cannot touch, it is taken for the gap.
+    Adds minus the contact force to ``force_out``. Where the coefficient of a point's cell shows
+    that the point cannot touch (`CELL`), it is taken for the gap.
     """
     item, q = wp.tid()
     f = items[item]
@@ -514,7 +509,7 @@ def core_contact(
         slope_out[f, q] = wp.vec3d()
         misfit_out[f, q] = wp.vec3d()
     p = pressure_in[f, q]
-    if rough + correction_in[f, q] < margin or p > wp.float64(0.0):
+    if rough + correction_in[f, q] < CELL * spacing or p > wp.float64(0.0):
         near = core_distance(coefficients, origin, spacing, x)
         gap = near.gap + correction_in[f, q]
         gap_out[f, q] = gap

@@ -55,14 +55,6 @@ class DistanceGrid:
     spacing: float
     coefficients: Floats
 
-    @property
-    def cell_margin_m(self) -> float:
-        """How far the distance at a point may be from the coefficient of its cell [m].
-
-        The coefficient's node is up to sqrt(3) spacings away.
-        """
-        return 2.0 * self.spacing
-
     @classmethod
     def sampled(cls, origin: Floats, spacing: float, values: Floats) -> DistanceGrid:
         """Interpolate values [m] given at the grid's nodes."""
