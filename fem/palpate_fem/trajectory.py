@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,9 +61,9 @@ class Region:
         return np.asarray(held & (z < 0.0) & (normals[:, 2] < -0.5))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PlannedIndentation:
-    """One planned trajectory.
+    """One planned trajectory; its poses are made when they are asked for.
 
     Attributes:
         name: ``<indenter>/<point>/<normal|angled-0..3>``.
@@ -70,9 +71,9 @@ class PlannedIndentation:
         target: Point on the line of the tip [m], shape (3,).
         normal: Outward normal there, shape (3,).
         direction: Direction of travel, shape (3,).
-        contact_m: Travel of the tip beyond the target at first contact [m]; mostly negative.
         depth_m: Travel from first contact to the last pose [m].
-        path: Poses, the first clear of the skin, shape (K + 1, 7).
+        steps: Number K of equal steps from first contact on.
+        surface: The skin that is pressed.
     """
 
     name: str
@@ -80,9 +81,39 @@ class PlannedIndentation:
     target: Floats
     normal: Floats
     direction: Floats
-    contact_m: float
     depth_m: float
-    path: Floats
+    steps: int
+    surface: OuterSurface
+
+    @property
+    def path(self) -> Floats:
+        """Poses, the first clear of the skin, shape (K + 1, 7); takes some milliseconds.
+
+        Raises:
+            SimulationError: The indenter passes the skin.
+        """
+        return self._straight[0]
+
+    @property
+    def contact_m(self) -> float:
+        """Travel of the tip beyond the target at first contact [m]; mostly negative.
+
+        Raises:
+            SimulationError: The indenter passes the skin.
+        """
+        return self._straight[1]
+
+    @cached_property
+    def _straight(self) -> tuple[Floats, float]:
+        return _straight_path(
+            make_indenter(self.indenter),
+            self.target,
+            self.direction,
+            self.surface,
+            self.depth_m,
+            self.steps,
+            CLEARANCE_M,
+        )
 
 
 def press_path(
@@ -408,12 +439,16 @@ class Campaign:
                     steps = self.steps
                     if self.increment_m is not None:
                         steps = round(depth_m / self.increment_m)
-                    path, contact_m = _straight_path(
-                        indenter, target, direction, self.surface, depth_m, steps, CLEARANCE_M
-                    )
                     at = f"{indenter.name}/{point:02d}/{way}"
                     yield PlannedIndentation(
-                        at, indenter.name, target, normal, direction, contact_m, depth_m, path
+                        at,
+                        indenter.name,
+                        target,
+                        normal,
+                        direction,
+                        depth_m,
+                        steps,
+                        self.surface,
                     )
 
 

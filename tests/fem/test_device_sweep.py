@@ -516,7 +516,8 @@ def test_as_many_files_may_be_open_as_trajectories_run() -> None:
 
 def test_processes_are_as_many_as_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.cpu_count", lambda: 32)
-    assert threads_and_packers(["cuda:0"] * 8) == (4, 16)
+    assert threads_and_packers(["cuda:0"]) == (4, 8)
+    assert threads_and_packers(["cuda:0"] * 8) == (4, 32)
     assert threads_and_packers(["cuda:0"], 3) == (4, 3)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     assert threads_and_packers(["cuda:0"] * 4) == (1, 2)

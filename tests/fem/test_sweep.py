@@ -18,12 +18,14 @@ import pytest
 from palpate.errors import DatasetError, RemoteError
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.config import FingertipParameters
+from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.indenter.distance import signed_distance
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.service.batch import BatchReport, OnReport, SimulationBatch, sweep_into_store
 from palpate_fem.service.jobs import WorkerSetup
 from palpate_fem.store.read import SimulationStore
+from palpate_fem.trajectory import PlannedIndentation
 
 fakes: Any = importlib.import_module("fem_fakes")
 
@@ -126,6 +128,26 @@ def into_store(path: Path, kind: float, count: int, stop: threading.Event) -> An
         return sweep_into_store(batch, plans(count), path, stop=stop)
     finally:
         batch.close()
+
+
+def test_a_path_that_cannot_be_made_does_not_stop_the_others(tmp_path: Path) -> None:
+    """Campaigns make each path when its turn comes."""
+    nodes = 0.01 * np.array(
+        [(1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, -1.0, 0.0), (-1.0, 1.0, 0.0)]
+    )
+    skin = OuterSurface(nodes, np.array([[0, 1, 2, 3]], np.int32))
+    up = np.array([0.0, 0.0, 1.0])
+    beside = PlannedIndentation(
+        "sphere_medium/09/normal", "sphere_medium", np.full(3, 0.1), -up, up, 1e-3, STEPS, skin
+    )
+    report, _ = store_batch(
+        tmp_path / "a.sim", batch_of(fakes.QUICK), [beside, *plans(2)], packers=0
+    )
+    assert report.outcomes == {"complete": 2, "failed": 1}
+    assert (report.done, report.total) == (3, 3)
+    (early,) = report.early
+    assert (early.name, early.how) == (beside.name, "failed")
+    assert "passes the fingertip" in early.reason
 
 
 def test_a_store_is_filled_and_resumed(tmp_path: Path) -> None:

@@ -1,8 +1,4 @@
-"""First contact of a moving indenter with a surface, and the check that it starts outside.
-
-A gap shrinks by no more than the indenter moves (sphere tracing). So the indenter may always move
-by the smallest gap, and points with a gap larger than the remaining travel can be dropped.
-"""
+"""First contact of a moving indenter with a surface, and the check that it starts outside."""
 
 from __future__ import annotations
 
@@ -15,12 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from palpate.errors import SimulationError
 from palpate.rigid import rotation_matrices, to_local, unit
 from palpate_fem.arrays import Floats, Ints
-from palpate_fem.indenter.distance import signed_distance
+from palpate_fem.indenter.distance import TOUCH_M, first_touch, signed_distance
 from palpate_fem.indenter.shape import Indenter, PrimitiveKind
 
-_TOUCH = 1e-9  # [m]; a smaller gap counts as contact
 _LARGE_M = 1.5e-3  # a face from this size on may be touched far from its corners
-_MOVES = 2000  # contact at a glancing angle is approached slowly
 _LEVELS = (3, 9, 25)  # points along a face's edge
 
 
@@ -99,19 +93,25 @@ def first_contact(
     end = float(along.max()) + _reach(indenter)
 
     # A few points give an upper limit of the travel, with which most of the others are dropped.
-    limit = _trace(indenter, points[:: max(1, len(points) // 200)], move, start, end)
-    limit = _trace(indenter, points, move, start, limit)
+    limit = first_touch(indenter, points[:: max(1, len(points) // 200)], move, start, end)
+    limit = first_touch(indenter, points, move, start, limit)
     # A face may be touched between its samples. There the gap is smaller than at the nearest sample
     # by at most their distance, so only faces with a gap below the spacing are sampled more finely.
     faces, spacing = np.arange(len(surface.faces)), 2.0 * sizes
-    samples = (surface.nodes[surface.faces] - target) @ turn
+    at_nodes = np.empty(len(surface.nodes))
+    on_skin = (surface.nodes[surface.used] - target) @ turn - limit * move
+    at_nodes[surface.used] = signed_distance(indenter, on_skin, spacing.max())
+    gap = at_nodes[surface.faces]
     for count in _LEVELS:
-        shifted = (samples - limit * move).reshape(-1, 3)
-        gap = signed_distance(indenter, shifted).reshape(samples.shape[:2]).min(axis=1)
-        near = gap < spacing
+        near = gap.min(axis=1) < spacing
         faces, spacing = faces[near], sizes[faces[near]] / (count - 1)
         samples = (surface.samples(count, faces) - target) @ turn
-        limit = _trace(indenter, samples.reshape(-1, 3), move, start, limit)
+        limit = first_touch(indenter, samples.reshape(-1, 3), move, start, limit)
+        if count == _LEVELS[-1]:
+            break
+        shifted = (samples - limit * move).reshape(-1, 3)
+        gap = signed_distance(indenter, shifted, spacing.max(initial=0.0))
+        gap = gap.reshape(samples.shape[:2])
     if limit >= end:
         raise SimulationError(
             f"indenter {indenter.name!r} passes the fingertip without touching it",
@@ -183,19 +183,4 @@ def _reach(indenter: Indenter) -> float:
         else:
             size = float(np.hypot(part.sizes[1], max(abs(part.sizes[2]), abs(part.sizes[3]))))
         far.append(float(np.linalg.norm(part.centre)) + size + part.rounding)
-    return max(far) + _TOUCH
-
-
-def _trace(indenter: Indenter, points: Floats, move: Floats, start: float, limit: float) -> float:
-    """Travel at which the indenter touches the first of the points [m], at most ``limit``."""
-    travel = start
-    for _ in range(_MOVES):
-        gap = signed_distance(indenter, points - travel * move)
-        near = gap < limit - travel
-        if not near.any():
-            return limit
-        points, smallest = points[near], float(gap[near].min())
-        if smallest <= _TOUCH:
-            return travel
-        travel += smallest
-    return travel
+    return max(far) + TOUCH_M

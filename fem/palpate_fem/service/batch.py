@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from palpate.errors import ConfigError, RemoteError, SimulationError
+from palpate.errors import ConfigError, PalpateError, RemoteError, SimulationError
 from palpate.process import Closing
 from palpate_fem.arrays import Floats
 from palpate_fem.calibration.runs import PlannedPath, SimulatedRun
@@ -301,7 +301,7 @@ def sweep_into_store(
     """Run the trajectories that a store does not hold yet; each is on the disk when it has ended.
 
     Several processes may fill one store at the same time. Each trajectory is stored with the
-    outline of its indenter, for pictures.
+    outline of its indenter, for pictures. One whose path cannot be made counts as failed.
 
     Args:
         batch: Runs them; the caller closes it.
@@ -339,9 +339,15 @@ def sweep_into_store(
         done = store.done()
         left = [plan for plan in plans if plan.name not in done]
         claims: dict[str, TrajectoryClaim] = {}
+        unmade: list[EarlyEnd] = []
 
         def claimed() -> Iterator[TrajectoryPlan]:
             for plan in left:
+                try:
+                    plan.path  # noqa: B018 - it may be made only now, which may fail
+                except PalpateError as error:
+                    unmade.append(EarlyEnd(plan.name, FAILED, error.problem, 0, 0))
+                    continue
                 with contextlib.suppress(StoreTakenError):  # another process runs it, or has run it
                     claims[plan.name] = store.claim(plan.name)
                     yield plan
@@ -363,6 +369,9 @@ def sweep_into_store(
         finally:
             for claim in claims.values():
                 claim.close()  # releases what was not written
+    if unmade:
+        report.outcomes[FAILED] += len(unmade)
+        report.early += unmade
     return report, len(plans) - len(left)
 
 

@@ -68,18 +68,21 @@ POLL_S = 0.1
 _THREADS_MOST = 4  # the fingertip is made on the CPU, and takes little more
 _WORKERS_MOST = 16  # few trajectories need the CPU
 
+_PACKERS_EACH = 8
+"""For a device. Each packs a trajectory and waits for the disk; a device has one in 30 to 50 ms."""
+
 
 def threads_and_packers(devices: Sequence[str], packers: int = 0) -> tuple[int, int]:
     """Threads for the process of each device, and processes that make files, on this host.
 
     Args:
         devices: The devices.
-        packers: Requested number of processes that make files; 0 = two for each device, if there
-            are as many cores: a device solves a trajectory in the time in which two pack it.
+        packers: Requested number of processes that make files; 0 = eight for each device, if there
+            are as many cores.
     """
     cores = os.cpu_count() or 1
     threads = max(1, min(_THREADS_MOST, cores // len(devices)))
-    return threads, packers or min(cores, 2 * len(devices))
+    return threads, packers or min(cores, _PACKERS_EACH * len(devices))
 
 
 class _Supply:
