@@ -227,8 +227,8 @@ def main() -> None:
     sections += [
         f"\n## Served\n\n{asked['device']}, `palpate fem serve --device cuda:0 --slots"
         f" {asked['slots']}` behind a router, each caller with one request after the other:"
-        f" `{asked['command']}`. *Bare*: the same presses in one process, nothing between;"
-        " measured before the changes that are named under *Sweeps*.\n",
+        f" `{asked['command']}` (code of {asked['commit']}). *Bare*: the same presses in one"
+        " process, nothing between.\n",
         served(asked),
         f"\nThe solver's process killed (SIGKILL) while 32 callers had requests there:"
         f" `{asked['killed']['command']}`. All were answered; workers began, and the next process"
