@@ -82,6 +82,14 @@ def test_makefile_describes_every_target() -> None:
     assert set(described) >= {"setup", "demo", "test", "check", "bench", "docs"}
 
 
+def test_make_bench_runs_programs_that_need_no_options() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (names,) = re.findall(r"for bench in ([a-z ]+);", makefile)
+    for name in names.split():
+        program = ROOT / "tests" / "benchmarks" / f"bench_{name}.py"
+        assert "required=True" not in program.read_text(encoding="utf-8"), program
+
+
 @pytest.fixture(scope="module")
 def command() -> Any:
     """The tree of `palpate` commands."""
