@@ -4,10 +4,11 @@
     python tests/benchmarks/bench_batched.py --edge-mm ... --out meshes.json
     python tests/benchmarks/bench_batched_factor.py ... --out factor.json
     python tests/benchmarks/bench_served.py ... --out served.json
+    python tests/benchmarks/bench_sweep.py ... --out sweeps.json
     python docs/make_fem_batched.py
 
-These files are in docs/results/fem-batched. ``sweeps.json`` beside them holds what ``palpate fem
-run --sweep --device`` said, command by command.
+These files are in docs/results/fem-batched. ``sweeps.json`` holds what was told of large data sets,
+too.
 """
 
 from __future__ import annotations
@@ -194,6 +195,24 @@ def served(report: dict[str, Any]) -> str:
     return markdown_table(head, rows)
 
 
+def swept(runs: list[dict[str, Any]]) -> str:
+    """Sweeps, from the command to the disk."""
+    head = ["command", "machine", "presses", "ms a trajectory", "first [s]", "99 % [s]",
+            "last [s]", "outcomes", "code of"]  # fmt: skip
+    return markdown_table(
+        head,
+        [
+            [
+                f"`{run['command']}`", f"{run['machine']}, {run['cores']} cores",
+                f"{run['results']:,}", f"**{run['ms_a_trajectory']:.0f}**",
+                f"{run['first_s']:.0f}", f"{run['most_s']:.0f}", f"{run['last_s']:.0f}",
+                outcomes(run), run["commit"],
+            ]
+            for run in runs
+        ],
+    )  # fmt: skip
+
+
 def main() -> None:
     """Write page and pictures."""
     report, meshes = read("slots.json"), read("meshes.json")
@@ -215,11 +234,13 @@ def main() -> None:
         f"All fronts: `{factor['command']}`. {factor['told']}\n",
         kernels(factor["runs"]),
         f"\n## Sweeps\n\n{sweeps['told']}\n",
+        swept(sweeps["runs"]),
+        f"\n{sweeps['told_sets']}\n",
         markdown_table(
             ["command", "presses", "ms a trajectory", "outcomes"],
             [
-                [f"`{run['command']}`", str(run["presses"]), f"{run['ms']:.0f}", run["outcomes"]]
-                for run in sweeps["runs"]
+                [f"`{run['command']}`", f"{run['presses']:,}", f"{run['ms']:.0f}", run["outcomes"]]
+                for run in sweeps["sets"]
             ],
         ),
     ]

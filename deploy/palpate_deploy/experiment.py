@@ -52,6 +52,7 @@ from palpate_fem.trajectory import (
     Campaign,
     PlannedIndentation,
     angled_direction,
+    points_first,
     segment_path,
 )
 from palpate_training.experiment.generate.simulator import (
@@ -166,7 +167,7 @@ def _indenters(spec: ExperimentSpec) -> tuple[str, ...]:
 
 
 def _presses(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[PlannedIndentation]:
-    """All planned presses, first points first: what is there early is a fair sample."""
+    """All planned presses, first points first."""
     plans = Campaign(
         skin_of(cast("StoredFingertip", fingertip)),
         _indenters(spec),
@@ -176,7 +177,7 @@ def _presses(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[Pl
         increment_m=INCREMENT_M,
         overtravel_m=spec.overtravel_m,
     )
-    return sorted(plans, key=lambda plan: (*plan.name.split("/")[1:], plan.name))
+    return points_first(plans)
 
 
 def _paths(

@@ -99,9 +99,9 @@ def files_of(store: Path) -> list[Path]:
     return list((store / "trajectories").glob("*/*/*.h5"))
 
 
-def bare(points: int, device: str, slots: int) -> dict[str, Any]:
+def bare(points: int, device: str, slots: int, edge_mm: float) -> dict[str, Any]:
     """The same presses in this process."""
-    tip = Fingertip.pressurised(biotac())
+    tip = Fingertip.pressurised(biotac(edge_m=1e-3 * edge_mm))
     surface = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
     numbers = {name: number for number, name in enumerate(indenter_names())}
     presses = [
@@ -119,13 +119,14 @@ def main() -> None:
     parser.add_argument("--ray", help="address of a cluster")
     parser.add_argument("--workers", type=int, help="processes that make files")
     parser.add_argument("--slots", type=int, default=SLOTS)
+    parser.add_argument("--edge-mm", type=float, default=0.47)
     parser.add_argument("--limit-s", type=float, default=30.0, help="for a press on a core")
     parser.add_argument("--kill", type=int, default=0, metavar="RESULTS")
     parser.add_argument("--bare", action="store_true")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     words = ["--points", str(options.points), "--slots", str(options.slots)]
-    words += ["--limit-s", f"{options.limit_s:g}"]
+    words += ["--limit-s", f"{options.limit_s:g}", "--edge-mm", f"{options.edge_mm:g}"]
     for device in options.device:
         words += ["--device", device]
     if options.ray is not None:
@@ -138,15 +139,19 @@ def main() -> None:
         )
     run = {"command": f"palpate fem run --sweep {shlex.join(words)}"} | run
     run |= {"cores": os.cpu_count()}
-    batched.say(run)
-    if options.bare:
-        run["bare"] = bare(options.points, options.device[0], options.slots)
-        batched.say(run["bare"])
     report: dict[str, Any] = {"schema": "palpate.sweep-benchmark 1", "runs": []}
     if options.out.exists():
         report = json.loads(options.out.read_text(encoding="utf-8"))
     report["runs"].append(run)
-    options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+    def keep() -> None:
+        batched.say(run)
+        options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+    keep()
+    if options.bare:
+        run["bare"] = bare(options.points, options.device[0], options.slots, options.edge_mm)
+        keep()
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ from palpate_fem.trajectory import (
     Campaign,
     angled_direction,
     pad_point,
+    points_first,
     press_path,
     segment_path,
 )
@@ -152,7 +153,7 @@ class RunOptions:
         skin = skin_of(fingertip)
         if self.sweep:
             names = tuple(make_indenter(name).name for name in self.indenters) or indenter_names()
-            return list(
+            return points_first(
                 Campaign(skin, names, self.points, self.seed, self.steps, angled=self.angled)
             )
         indenter = make_indenter((self.indenters or (DEFAULT_INDENTER,))[0])
