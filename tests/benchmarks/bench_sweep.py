@@ -78,7 +78,10 @@ def sweep(words: list[str], store: Path, *, kill: int, ray: bool) -> dict[str, A
                 killed_s = time.time() - began
         whole_s = time.time() - began
         said.seek(0)
-        report = json.load(said)
+        text = said.read()
+    if not text:
+        raise SystemExit(f"{shlex.join(command)} failed, see above")
+    report = json.loads(text)
     came = sorted(path.stat().st_mtime - began for path in files_of(store))
     most = round(MOST * len(came))
     return {
