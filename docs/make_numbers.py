@@ -104,6 +104,11 @@ def _fem() -> Iterator[Claim]:
         figures,
     )
     yield Claim("docs/twin.md", "{ms192xxm} ms a press instead of {ms192}\n", figures)
+    one, three = (
+        f"{run['ms_a_trajectory']:.0f}" for run in _read("fem-batched/sweeps.json")["runs"][:2]
+    )
+    figures = {"one": one, "three": three}
+    yield Claim("README.md", "files included, {one} ms, with three processes {three} |", figures)
 
 
 def _name_of(run: dict[str, Any]) -> str:
