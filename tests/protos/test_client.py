@@ -7,18 +7,22 @@ import dataclasses
 import inspect
 import logging
 import math
+import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from typing import Any
+from typing import Any, cast
 
 import pytest
+import zenoh
 
 from palpate import AsyncClient, Client
 from palpate.bus import Session, endpoints, run_router
+from palpate.bus.link import close_zenoh
 from palpate.bus.topics import FEATURES
 from palpate.client.simulations import straight_path
 from palpate.config import LinkConfig
@@ -323,6 +327,43 @@ def test_a_program_that_leaves_its_client_open_ends_well(link: LinkConfig, finge
             check=False,
         )
         assert (result.returncode, result.stdout, result.stderr) == (0, "ends\n", "")
+
+
+_ROUTER = """
+import sys, threading
+from palpate.bus import run_router
+run_router((sys.argv[1],), threading.Event())
+"""
+
+
+def test_leaving_a_router_that_hangs_ends_well(free_port: int, wait_until: WaitUntil) -> None:
+    """After a look for processes it takes Zenoh 10 s, and mostly ended in an error of its own."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+
+    def listens() -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", free_port)) == 0
+
+    router = subprocess.Popen([sys.executable, "-c", _ROUTER, endpoint])
+    try:
+        wait_until(listens, LIVE_S)
+        client = Client(endpoint, timeout_s=1.0)
+        client.status()  # it joins
+        router.send_signal(signal.SIGSTOP)
+        client.status()
+        client.close()
+    finally:
+        router.kill()
+        router.wait()
+
+
+def test_a_session_that_does_not_close_is_given_up(caplog: pytest.LogCaptureFixture) -> None:
+    class Hanging:
+        def close(self) -> None:
+            raise zenoh.ZError("close operation timed out!")
+
+    close_zenoh(cast("zenoh.Session", Hanging()))
+    assert "router hangs" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import json
+import logging
 import re
 import secrets
 import threading
@@ -51,6 +52,8 @@ from palpate.bus.topics import (
 from palpate.config import LinkConfig, check_name
 from palpate.errors import ConfigError, LinkError, PalpateError, WireError
 from palpate.process import Closing
+
+_log = logging.getLogger(__name__)
 
 INDIRECT_WAIT_S = 60.0
 """Without direct links opening blocks until the router answers; it gives up after this time [s]."""
@@ -199,6 +202,14 @@ def open_zenoh(link: LinkConfig, mode: str, *, also_listen: Sequence[str] = ()) 
         ) from error
 
 
+def close_zenoh(session: zenoh.Session) -> None:
+    """Close a Zenoh session; where its router hangs, it is given up, with a warning."""
+    try:
+        session.close()
+    except zenoh.ZError:
+        _log.warning("left the bus without its answer: its router hangs")
+
+
 M = TypeVar("M")
 Q = TypeVar("Q")
 R = TypeVar("R")
@@ -254,7 +265,7 @@ class Session(Closing):
             deadline = time.monotonic() + link.wait_for_router_s
             while not raw.info.routers_zid() and not raw.info.peers_zid():
                 if time.monotonic() > deadline:
-                    raw.close()
+                    close_zenoh(raw)
                     raise no_router(link)
                 time.sleep(0.02)
         return cls(raw, station, link)
@@ -620,13 +631,13 @@ class Session(Closing):
         return bool(self._raw.info.routers_zid())
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Leave the bus; takes up to 10 s where the router hangs."""
         _open.discard(self)
         for close in reversed(self._closing):
             with contextlib.suppress(zenoh.ZError):  # already undeclared, or the session is gone
                 close()
         self._closing.clear()
-        self._raw.close()
+        close_zenoh(self._raw)
 
     def _keep(self, thing: K) -> K:
         self._closing.append(thing.close)

@@ -21,7 +21,7 @@ import zenoh
 
 from palpate.bus.access import DOOR_PROTOCOL, DOOR_ROOT, ROLE_OF
 from palpate.bus.claims import SensorClaims
-from palpate.bus.link import Session, open_zenoh, zenoh_config
+from palpate.bus.link import Session, close_zenoh, open_zenoh, zenoh_config
 from palpate.bus.topics import STATION_ROOT
 from palpate.config import LinkConfig
 from palpate.errors import ClaimedElsewhere, LinkError
@@ -99,7 +99,7 @@ def _run_once(config: LinkConfig, stop: threading.Event, guard: _NameGuard | Non
                         if guard.may_connect() != connects:
                             return
         finally:
-            raw.close()
+            close_zenoh(raw)
 
 
 class _NameGuard(Closing):
