@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from palpate.bus import Session, endpoints
-from palpate.errors import PalpateError
+from palpate.errors import LinkError, PalpateError
 from palpate.messages import ServiceRequest, Status
 
 ProcessName = tuple[str, str]
@@ -56,7 +56,7 @@ def take_census(
     started may not be reachable yet.
 
     Raises:
-        LinkError: There is no router.
+        LinkError: There is no router, or it is gone or hangs and nothing is known.
     """
     observer = session.observer()
     wanted = set(expected)
@@ -75,6 +75,11 @@ def take_census(
         if not (silent or lost) or time.monotonic() + _PAUSE_S > deadline:
             break
         time.sleep(_PAUSE_S)
+    if not (connected or names):
+        raise LinkError(
+            "the router is gone or hangs, so nothing is known of the station",
+            remedy="see that `palpate up` runs; this session joins again by itself",
+        )
     if connected and ROUTER in wanted:
         present[ROUTER] = True
     return [

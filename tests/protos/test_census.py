@@ -12,6 +12,7 @@ from palpate.bus import Session, endpoints
 from palpate.census import ROUTER, take_census
 from palpate.client import Client
 from palpate.config import LinkConfig
+from palpate.errors import LinkError
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceRequest, ServiceState, Status, SupervisedProcess
 
@@ -123,3 +124,18 @@ def test_presence_is_known_while_the_router_is_away(
                 time.sleep(0.01)
             assert [one.service for one in session.alive()] == ["features"]
         assert [one.service for one in session.alive()] == ["features"]
+
+
+def test_nothing_known_without_a_router_is_an_error_and_not_an_empty_station(
+    router: Callable[[], AbstractContextManager[LinkConfig]],
+) -> None:
+    with ExitStack() as stack:
+        with router() as link:
+            robot = stack.enter_context(Client(link.connect[0], timeout_s=0.5))
+            assert robot.status() == []
+        deadline = time.monotonic() + 20.0
+        while robot.session.observer().has_router():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        with pytest.raises(LinkError, match="the router is gone"):
+            robot.status()

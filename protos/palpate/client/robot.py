@@ -433,14 +433,14 @@ class Client(Closing):
         return self.session.alive()
 
     def status(self) -> list[Status]:
-        """Status of every process of the station that answers; complete as ``census`` is."""
+        """Status of every process of the station that answers; as ``census``, also in errors."""
         return [one.status for one in self.census() if one.status is not None]
 
     def census(self) -> list[ProcessReport]:
         """Every process that lives or should live, with its status, or that it does not answer.
 
         Raises:
-            LinkError: There is no router.
+            LinkError: There is no router, or it is gone or hangs and nothing is known.
         """
         return take_census(self.session, timeout_s=self._timeout_s)
 
