@@ -69,7 +69,7 @@ _THREADS_MOST = 4  # the fingertip is made on the CPU, and takes little more
 _WORKERS_MOST = 16  # few trajectories need the CPU
 
 _PACKERS_EACH = 8
-"""For a device. Each packs a trajectory and waits for the disk; a device has one in 30 to 50 ms."""
+"""For each device: it has a trajectory every 30 to 50 ms, and waited for two (ADR 26)."""
 
 
 def threads_and_packers(devices: Sequence[str], packers: int = 0) -> tuple[int, int]:

@@ -222,5 +222,5 @@ class _Visitor(Closing):
 
     def close(self) -> None:
         """Leave."""
-        self._session.close()
+        close_zenoh(self._session)
         self._queryable.undeclare()
