@@ -108,7 +108,9 @@ def _fem() -> Iterator[Claim]:
         f"{run['ms_a_trajectory']:.0f}" for run in _read("fem-batched/sweeps.json")["runs"][:2]
     )
     figures = {"one": one, "three": three}
-    yield Claim("README.md", "files included, {one} ms, with three processes under MPS {three} |", figures)
+    yield Claim(
+        "README.md", "files included, {one} ms, with three processes under MPS {three} |", figures
+    )
 
 
 def _name_of(run: dict[str, Any]) -> str:

@@ -48,6 +48,12 @@ class OuterSurface:
         """Numbers of the nodes that are a face's corner, ascending."""
         return np.unique(self.faces)
 
+    def at_corners(self, values: Floats) -> Floats:
+        """Values of the nodes in ``used``, (N,), at each face's corners, (F, 3) or (F, 4)."""
+        at_nodes = np.empty(len(self.nodes))
+        at_nodes[self.used] = values
+        return at_nodes[self.faces]
+
     @cached_property
     def sizes(self) -> Floats:
         """Of each face the largest distance between opposite corners [m], shape (F,)."""
@@ -98,10 +104,8 @@ def first_contact(
     # A face may be touched between its samples. There the gap is smaller than at the nearest sample
     # by at most their distance, so only faces with a gap below the spacing are sampled more finely.
     faces, spacing = np.arange(len(surface.faces)), 2.0 * sizes
-    at_nodes = np.empty(len(surface.nodes))
-    on_skin = (surface.nodes[surface.used] - target) @ turn - limit * move
-    at_nodes[surface.used] = signed_distance(indenter, on_skin, spacing.max())
-    gap = at_nodes[surface.faces]
+    on_skin = points[: len(surface.used)] - limit * move
+    gap = surface.at_corners(signed_distance(indenter, on_skin, spacing.max()))
     for count in _LEVELS:
         near = gap.min(axis=1) < spacing
         faces, spacing = faces[near], sizes[faces[near]] / (count - 1)
@@ -134,9 +138,8 @@ def check_clear(indenter: Indenter, pose: Floats, surface: OuterSurface) -> floa
     Raises:
         SimulationError: It touches or is inside; says by how much.
     """
-    at_nodes = np.empty(len(surface.nodes))
-    at_nodes[surface.used] = signed_distance(indenter, to_local(pose, surface.nodes[surface.used]))
-    at_corners = at_nodes[surface.faces].min(axis=1)
+    on_skin = to_local(pose, surface.nodes[surface.used])
+    at_corners = surface.at_corners(signed_distance(indenter, on_skin)).min(axis=1)
     # Nowhere on a face is the gap smaller than at its corners by more than its size.
     near = np.flatnonzero(at_corners - surface.sizes <= at_corners.min())
     points = surface.samples(_LEVELS[0], near).reshape(-1, 3)
