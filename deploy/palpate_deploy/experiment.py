@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.cluster import RayCluster
+from palpate.errors import ConfigError
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.config import FingertipParameters
 from palpate_fem.electrodes.electronics import (
@@ -164,6 +165,23 @@ def _indenters(spec: ExperimentSpec) -> tuple[str, ...]:
     """Names of an experiment's indenters."""
     named = tuple(make_indenter(name).name for name in spec.indenters)
     return named or indenter_names() + (BETWEEN if spec.presses else ())
+
+
+def with_indenters_met(spec: ExperimentSpec, specimens: Sequence[Specimen]) -> ExperimentSpec:
+    """An experiment with those of its indenters that some specimen was pressed with.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    names = _indenters(spec)
+    met = tuple(name for name in names if any(one.pressed_with(name) for one in specimens))
+    if not met:
+        who = ", ".join(one.name for one in specimens)
+        raise ConfigError(
+            f"no specimen of {who} was pressed with {', '.join(names)}",
+            remedy="name other indenters, or other specimens with --units",
+        )
+    return spec if met == names else replace(spec, indenters=met)
 
 
 def _presses(spec: ExperimentSpec, fingertip: SimulatedFingertip) -> Sequence[PlannedIndentation]:

@@ -339,6 +339,35 @@ def test_fingertips_have_skins_presses_and_specimens_of_their_own(tmp_path: Path
     assert (other / MIXED).stat().st_mtime_ns == stamp
 
 
+def test_indenters_that_no_specimen_was_pressed_with_are_left_out(tmp_path: Path) -> None:
+    """The published biotac-1 met spheres alone, and has a fingertip of its own here."""
+    out = tmp_path / "several"
+    words = ["generate", str(out), "--random", "4", "--fingertips", "2", "--edge-mm", "1.2"]
+    words += ["--layers", "1", "--indenter", "cube", "--indenter", "sphere_medium"]
+    done = CliRunner().invoke(twin_app, [*words, "--workers", "1", "--json"])
+    assert done.exit_code == 0, done.output
+    for number, shapes in enumerate((["sphere_medium"], ["cube", "sphere_medium"]), start=1):
+        folder = out / f"fingertip-{number:02d}"
+        assert json.loads((folder / SPEC_FILE).read_text())["spec"]["indenters"] == shapes
+        ids = SimulationStore.open(folder / STORE).ids()
+        assert sorted({name.split("/")[0] for name in ids}) == shapes
+        assert len(ids) == 2
+    units, no = tmp_path / "spheres.json", tmp_path / "no"
+    write_population(units, members()[:1], source="published")
+    words = ["generate", str(no), "--points", "1", "--indenter", "cube", "--units", str(units)]
+    refused = CliRunner().invoke(twin_app, words)
+    assert isinstance(refused.exception, ConfigError)
+    assert "no specimen of biotac-1 was pressed with cube" in str(refused.exception)
+    assert not no.exists()
+
+
+def test_trials_are_done_though_no_specimen_met_an_indenter(tmp_path: Path) -> None:
+    spec = replace(SPEC, angled=0, layers=1, indenters=("cube", "sphere_medium"))
+    done = generate(tmp_path, spec, specimens()[:1], FemSimulator(), workers=1)
+    assert done is not None
+    assert [name.split("/")[0] for name in done.data.experiment.trajectories] == ["sphere_medium"]
+
+
 def test_fingertips_without_presses_or_specimens_are_refused(tmp_path: Path) -> None:
     out = tmp_path / "no"
     for extra, said in (

@@ -11,6 +11,7 @@ import contextlib
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -198,7 +199,12 @@ def data_generate(
     As the paper does: nine indenters at ten points of three specimens. Or at random, on one
     fingertip or on several.
     """
-    from palpate_deploy.experiment import FemSimulator, fingertip_settings, read_specimens
+    from palpate_deploy.experiment import (
+        FemSimulator,
+        fingertip_settings,
+        read_specimens,
+        with_indenters_met,
+    )
     from palpate_fem.cli.model import workers_for
     from palpate_fem.cli.terminal import progress_bar, stop_on_signal
     from palpate_fem.config import LIMITS
@@ -245,6 +251,9 @@ def data_generate(
     if fingertips:
         drawn = [fingertip_settings(tip) for tip in draw_fingertips(fingertips, seed)]
         shares = share_out(spec, drawn, specimens)
+    shares = [
+        replace(share, spec=with_indenters_met(share.spec, share.specimens)) for share in shares
+    ]
     count, threads = workers_for(workers)
     summaries: list[dict[str, object]] = []
     for share in shares:

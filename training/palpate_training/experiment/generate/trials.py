@@ -74,6 +74,8 @@ def make_trials(
 ) -> bool:
     """Execute what the store holds; trials that the folder holds already are not made again.
 
+    Trajectories of indenters that no specimen was pressed with are left out.
+
     Returns:
         Whether all are there; False = stopped.
 
@@ -86,8 +88,12 @@ def make_trials(
         *simulator.plans(spec, fingertip),
         *simulator.manipulations(spec, fingertip),
     ]
-    plans = [plan for plan in every if plan.trajectory in there]
-    left = [plan for plan in plans if not file_of(folder, plan.trajectory).exists()]
+    plans = [
+        (plan, who)
+        for plan in every
+        if plan.trajectory in there and (who := _executed_by(spec, specimens, plan))
+    ]
+    left = [(plan, who) for plan, who in plans if not file_of(folder, plan.trajectory).exists()]
     done = len(plans) - len(left)
     on_progress(done, len(plans), "")
     if not left:
@@ -348,24 +354,31 @@ def unpack(data: bytes) -> TrialsDone:
         )
 
 
+def _executed_by(
+    spec: ExperimentSpec,
+    specimens: Sequence[Specimen],
+    plan: PlannedTrajectory | PlannedManipulation,
+) -> list[int]:
+    """Which specimens execute a trajectory."""
+    who = [i for i, one in enumerate(specimens) if one.pressed_with(plan.indenter)]
+    if 0 < spec.units_each < len(who):
+        draw = np.random.default_rng([spec.seed, zlib.crc32(plan.trajectory.encode())])
+        return sorted(draw.choice(who, spec.units_each, replace=False).tolist())
+    return who
+
+
 def _tasks(
     spec: ExperimentSpec,
     store: IndentationStore,
     specimens: Sequence[Specimen],
-    plans: Sequence[PlannedTrajectory | PlannedManipulation],
+    plans: Sequence[tuple[PlannedTrajectory | PlannedManipulation, list[int]]],
     simulator: TwinSimulator,
     *,
     in_worker: bool,
 ) -> Iterator[TrialTask]:
     seed = spec.seed if spec.registration_seed is None else spec.registration_seed
     errors, fingertip = registration_errors(specimens, seed), store.fingertip()
-    for plan in plans:
-        who = [i for i, one in enumerate(specimens) if one.pressed_with(plan.indenter)]
-        if 0 < spec.units_each < len(who):
-            draw = np.random.default_rng([spec.seed, zlib.crc32(plan.trajectory.encode())])
-            who = sorted(draw.choice(who, spec.units_each, replace=False).tolist())
-        if not who:
-            continue
+    for plan, who in plans:
         name = plan.trajectory
         yield TrialTask(
             name=name,
