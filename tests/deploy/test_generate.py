@@ -28,6 +28,7 @@ from palpate_fem.store.read import SimulationStore
 from palpate_training.datasets.experiment import read_experiment, read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import joined
+from palpate_training.experiment.generate.fingertips import share_out
 from palpate_training.experiment.generate.pipeline import (
     EXPERIMENT,
     MIXED,
@@ -38,7 +39,7 @@ from palpate_training.experiment.generate.pipeline import (
     provenance_sha256,
 )
 from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
-from palpate_training.experiment.generate.simulator import ExperimentSpec, Specimen, share_out
+from palpate_training.experiment.generate.simulator import ExperimentSpec, Specimen
 from palpate_training.experiment.generate.workers import WorkerProcesses
 
 SPEC = ExperimentSpec(
@@ -312,8 +313,9 @@ def test_fingertips_have_skins_presses_and_specimens_of_their_own(tmp_path: Path
     write_population(units, draw_members(4, 3), source="drawn")
     words = ["generate", str(out), "--random", "3", "--fingertips", "2", "--units", str(units)]
     words += ["--units-each", "1", "--edge-mm", "1.2", "--indenter", "sphere_medium"]
-    words += ["--workers", "1", "--strain-stiffening", "0.01", "--json"]
-    done = runner.invoke(twin_app, words)
+    words += ["--strain-stiffening", "0.01", "--layers", "1", "--json"]
+    words += ["--device", "cpu", "--device", "cpu", "--slots", "1"]
+    done = runner.invoke(twin_app, words)  # each device presses one of them
     assert done.exit_code == 0, done.output
     one, other = (out / "fingertip-01", out / "fingertip-02")
     specs = [json.loads((tip / SPEC_FILE).read_text())["spec"] for tip in (one, other)]

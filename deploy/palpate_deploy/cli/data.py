@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from palpate_training.experiment.generate.measured import Dropped, ProcessedExperiment
-    from palpate_training.experiment.generate.pipeline import GeneratedExperiment, OnStage
+    from palpate_training.experiment.generate.pipeline import GeneratedExperiment
     from palpate_training.experiment.generate.simulator import OnProgress
     from palpate_training.experiment.plan import EliminatedTrajectory, RobotPlan
 
@@ -185,7 +185,8 @@ def data_generate(
             "--device",
             metavar="NAME",
             help="Solve many trajectories at once on this device: cuda:0, ..., or cpu; repeatable. "
-            "With --ray: cuda = on each GPU of the cluster.",
+            "With --fingertips each named one has a fingertip of its own at a time; with --ray: "
+            "cuda = on each GPU of the cluster.",
         ),
     ] = None,
     slots: Annotated[
@@ -212,14 +213,13 @@ def data_generate(
     from palpate_fem.indenter.path import parse_segments, show_segments
     from palpate_fem.population.fingertips import draw_fingertips
     from palpate_fem.service.device_process import check_places
-    from palpate_training.experiment.generate.pipeline import MIXED, is_finished
-    from palpate_training.experiment.generate.pipeline import generate as run
-    from palpate_training.experiment.generate.simulator import (
-        FLUID_VOLUME_M3,
-        ExperimentSpec,
+    from palpate_training.experiment.generate.fingertips import (
         FingertipShare,
+        SharedExperiment,
         share_out,
     )
+    from palpate_training.experiment.generate.pipeline import MIXED
+    from palpate_training.experiment.generate.simulator import FLUID_VOLUME_M3, ExperimentSpec
 
     check_places(device or (), slots, ray)
     fill_m3 = FLUID_VOLUME_M3 if fill_ml is None else fill_ml * 1e-6
@@ -255,33 +255,30 @@ def data_generate(
         replace(share, spec=with_indenters_met(share.spec, share.specimens)) for share in shares
     ]
     count, threads = workers_for(workers)
-    summaries: list[dict[str, object]] = []
-    for share in shares:
-        folder = out / share.name
-        if fingertips and is_finished(folder, share.spec, share.specimens):
-            summaries.append({"folder": str(folder), "finished": "before"})
-            continue
-        with stop_on_signal() as stop, progress_bar() as bar:
-            result = run(
-                folder,
-                share.spec,
-                share.specimens,
-                FemSimulator(),
-                workers=count,
-                threads=threads,
-                ray=ray,
-                devices=tuple(device or ()),
-                slots=slots,
-                stop=stop,
-                on_stage=_stages(bar, share.name),
-                command=typed_command(),
-            )
-        if result is None:
-            typer.echo(f"stopped; {out} keeps what is done: run the command again to go on")
-            raise typer.Exit(1)
-        summaries.append(_generated_summary(result))
-        if not as_json:
-            _show_generated(result)
+    experiment = SharedExperiment(
+        out,
+        FemSimulator(),
+        _generated_summary,
+        workers=count,
+        threads=threads,
+        ray=ray,
+        devices=tuple(device or ()),
+        slots=slots,
+        command=typed_command(),
+    )
+    found: dict[str, dict[str, Any]] = {}
+    with stop_on_signal() as stop, progress_bar() as bar:
+        stages = _Stages(bar)
+        for share, summary in experiment.made(shares, stop, stages.show):
+            stages.end(share.name)
+            before = {"folder": str(out / share.name), "finished": "before"}
+            found[share.name] = before if summary is None else summary
+            if summary is not None and not as_json:
+                _show_generated(summary)
+    if len(found) < len(shares):
+        typer.echo(f"stopped; {out} keeps what is done: run the command again to go on")
+        raise typer.Exit(1)
+    summaries = [found[share.name] for share in shares]
     if as_json:
         typer.echo(json.dumps(summaries if fingertips else summaries[0], indent=1))
     elif fingertips:
@@ -291,16 +288,23 @@ def data_generate(
         )
 
 
-def _stages(bar: Progress, prefix: str) -> OnStage:
-    """Shows each stage of an experiment in a progress bar."""
-    tasks: dict[str, TaskID] = {}
+class _Stages:
+    """Shows each stage of experiments that are being made in a progress bar."""
 
-    def on_stage(stage: str, done: int, total: int, word: str) -> None:
-        if stage not in tasks:
-            tasks[stage] = bar.add_task(f"{prefix} {stage}".strip(), total=total)
-        bar.update(tasks[stage], completed=done, total=total, info=word)
+    def __init__(self, bar: Progress) -> None:
+        self._bar = bar
+        self._tasks: dict[tuple[str, str], TaskID] = {}
 
-    return on_stage
+    def show(self, name: str, stage: str, done: int, total: int, word: str) -> None:
+        """Show the progress of a stage of the experiment with that name."""
+        if (name, stage) not in self._tasks:
+            self._tasks[name, stage] = self._bar.add_task(f"{name} {stage}".strip(), total=total)
+        self._bar.update(self._tasks[name, stage], completed=done, total=total, info=word)
+
+    def end(self, name: str) -> None:
+        """Take the stages of an experiment away."""
+        for key in [key for key in self._tasks if key[0] == name]:
+            self._bar.remove_task(self._tasks.pop(key))
 
 
 @twin_app.command(
@@ -330,7 +334,7 @@ def data_sample(
     )
 
 
-def _generated_summary(result: GeneratedExperiment) -> dict[str, object]:
+def _generated_summary(result: GeneratedExperiment) -> dict[str, Any]:
     experiment, mixed = result.data.experiment, result.data.mixed
     return {
         "folder": str(result.folder),
@@ -349,15 +353,14 @@ def _generated_summary(result: GeneratedExperiment) -> dict[str, object]:
     }
 
 
-def _show_generated(result: GeneratedExperiment) -> None:
-    summary = _generated_summary(result)
-    dropped = result.data.dropped
+def _show_generated(summary: dict[str, Any]) -> None:
     for key, value in summary.items():
         if key != "dropped":
             typer.echo(f"{key:20} {value}")
+    dropped = summary["dropped"]
     typer.echo(f"{'left out':20} {len(dropped)} trials of one or both data sets")
     show_left_out(dropped)
-    typer.echo(f"look at it: palpate data inspect {result.folder / 'mixed.h5'}")
+    typer.echo(f"look at it: palpate data inspect {summary['folder']}/mixed.h5")
 
 
 @contextlib.contextmanager

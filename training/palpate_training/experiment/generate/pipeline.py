@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate import __version__
-from palpate.cluster import RayCluster
+from palpate.cluster import RayCluster, WorkerLostError
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
 from palpate_training.datasets.container import Provenance
@@ -148,6 +148,10 @@ def generate(
         seconds["trials"] = time.monotonic() - began
         began = time.monotonic()
         data, digest = _assemble(folder, spec, specimens, simulator, processes, on_stage, command)
+    except WorkerLostError:
+        if not stop.is_set():
+            raise
+        return None  # a signal to the whole group ended workers, too
     finally:
         processes.close()
         if cluster is not None:

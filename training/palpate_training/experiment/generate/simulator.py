@@ -1,4 +1,4 @@
-"""Settings of an experiment, also on several fingertips, and what it needs of a simulation.
+"""Settings of an experiment, and what it needs of a simulation.
 
 Training must not import the finite elements. These protocols are what it needs of them, and deploy
 passes an implementation in. Arrays are in the sensor frame, SI.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.cluster import RayCluster
-from palpate.errors import ConfigError
 from palpate.rigid import path_lengths
 from palpate_training.experiment.plan import PlannedManipulation, PlannedTrajectory
 
@@ -44,8 +43,6 @@ _STRAIGHT_M = 1e-9
 
 OVERTRAVEL_M = 0.6e-3
 """How much deeper than the paper's depths paths go [m]: robots stand wrong by up to that."""
-
-_SEEDS = 1000  # of one experiment on several fingertips; presses are a function of the seed
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,54 +345,3 @@ class TwinSimulator(Protocol):
 
     def clear_steps(self, indentation: SimulatedTrajectory, fingertip: SimulatedFingertip) -> int:
         """How many steps there are before the indenter bears on what holds the finger."""
-
-
-@dataclass(frozen=True, slots=True)
-class FingertipShare:
-    """What one of several fingertips gets of an experiment.
-
-    A simulation belongs to one fingertip, and so does what is made of it: each has a folder with an
-    experiment, and `palpate_training.datasets.features.joined` puts their rows together.
-
-    Attributes:
-        name: Of its folder.
-        spec: Its experiment.
-        specimens: Those whose skin it is.
-    """
-
-    name: str
-    spec: ExperimentSpec
-    specimens: tuple[Specimen, ...]
-
-
-def share_out(
-    spec: ExperimentSpec, fingertips: Sequence[Mapping[str, Any]], specimens: Sequence[Specimen]
-) -> tuple[FingertipShare, ...]:
-    """Deal presses and specimens evenly, the first specimens to the first fingertip.
-
-    Args:
-        spec: The experiment; its presses are divided.
-        fingertips: Skin and fill of each, by the names of the settings of an experiment.
-        specimens: Each gets one of the fingertips.
-
-    Raises:
-        ConfigError: A fingertip would have no press, or fewer specimens than execute each; or there
-            are too many.
-    """
-    count, least = len(fingertips), max(1, spec.units_each)
-    if not 0 < count <= min(_SEEDS, spec.presses, len(specimens) // least):
-        raise ConfigError(
-            f"{spec.presses} presses and {len(specimens)} specimens for {count} fingertips",
-            remedy=f"give each of at most {_SEEDS} a press and {least} specimens",
-        )
-    shares = []
-    for number, fingertip in enumerate(fingertips):
-        (first, end), (one, other) = (
-            [total * k // count for k in (number, number + 1)]
-            for total in (spec.presses, len(specimens))
-        )
-        own = replace(spec, presses=end - first, seed=_SEEDS * spec.seed + number, **fingertip)
-        shares.append(
-            FingertipShare(f"fingertip-{number + 1:02d}", own, tuple(specimens[one:other]))
-        )
-    return tuple(shares)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -39,6 +40,8 @@ class TaskRunner(Protocol):
 
 def begin_worker() -> None:
     """Let a worker use one core: there are as many, and threads of each would only wait."""
+    # Ctrl-C is for the command. A worker that it ended would look as if memory had run out.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     importlib.import_module("scipy.linalg")  # brings a linear algebra of its own, as NumPy does
     require("threadpoolctl", extra="training").threadpool_limits(1)
