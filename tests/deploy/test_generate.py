@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.cluster import RayCluster, WorkerLostError
-from palpate.errors import ConfigError, DatasetError, LinkError
+from palpate.errors import ConfigError, DatasetError, LinkError, MissingExtraError
 from palpate.files.tape import read_tape
 from palpate_deploy.cli.data import twin_app
 from palpate_deploy.experiment import FemSimulator, specimens_of
@@ -368,6 +368,15 @@ def test_trials_are_done_though_no_specimen_met_an_indenter(tmp_path: Path) -> N
     done = generate(tmp_path, spec, specimens()[:1], FemSimulator(), workers=1)
     assert done is not None
     assert [name.split("/")[0] for name in done.data.experiment.trajectories] == ["sphere_medium"]
+
+
+def test_what_trials_need_is_missed_before_anything_is_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    with pytest.raises(MissingExtraError, match="pinocchio"):
+        run(tmp_path / "no")
+    assert not (tmp_path / "no").exists()
 
 
 def test_fingertips_without_presses_or_specimens_are_refused(tmp_path: Path) -> None:

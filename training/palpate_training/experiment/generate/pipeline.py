@@ -19,6 +19,7 @@ from palpate import __version__
 from palpate.cluster import RayCluster, WorkerLostError
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
+from palpate.process import check_installed
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import write_experiment, write_mixed
 from palpate_training.experiment.generate.data_sets import AssembledSets, assemble
@@ -108,7 +109,10 @@ def generate(
         ConfigError: The folder holds another experiment, or there are no such devices.
         LinkError: No cluster answers.
         DatasetError: What is there is damaged, or the disk refuses.
+        MissingExtraError: The training extra is not installed.
     """
+    for module in ("pinocchio", "threadpoolctl"):  # of trials; told before hours of mechanics
+        check_installed(module, extra="training")
     stop = stop or threading.Event()
     keep_spec(folder, spec, specimens)
     seconds: dict[str, float] = {}
