@@ -39,6 +39,9 @@ class Scripted(SharedExperiment[str]):
         on_stage: OnStage,
     ) -> str | None:
         on_stage("mechanics", 1, 2, share.name)
+        if "pressed" in share.name:
+            on_stage("trials", 0, 1, "")
+            wait_for(self.out / "next.begun", stop)
         (self.out / share.name).with_suffix(".begun").write_text(" ".join(devices))
         if "damaged" in share.name:
             raise DatasetError(f"{share.name} is damaged", remedy="remove it")
@@ -50,6 +53,14 @@ class Scripted(SharedExperiment[str]):
             os.kill(os.getpid(), signal.SIGTERM)
             os.kill(os.getpid(), signal.SIGINT)
         return f"{share.name}: {workers} workers"
+
+
+def wait_for(path: Path, stop: threading.Event) -> None:
+    end = time.monotonic() + LONG_S
+    while not path.exists() and not stop.is_set():
+        if time.monotonic() > end:
+            raise DatasetError(f"{path} has not come", remedy="none")
+        time.sleep(0.01)
 
 
 def scripted(out: Path, *devices: str) -> Scripted:
@@ -72,6 +83,13 @@ def test_all_are_made_each_on_one_device_with_progress(tmp_path: Path) -> None:
     assert sorted(told) == [(n, "mechanics", 1, 2, n) for n in ("a", "b", "c", "d", "signalled")]
     for name in summaries:
         assert (tmp_path / f"{name}.begun").read_text() in ("cuda:0", "cuda:1")
+
+
+def test_a_device_presses_the_next_while_trials_are_made(tmp_path: Path) -> None:
+    """Both devices are free though what they have pressed is not done."""
+    experiment = scripted(tmp_path, "cuda:0", "cuda:1")
+    found = experiment.made(shares("pressed-1", "pressed-2", "next"), threading.Event())
+    assert {share.name for share, _ in found} == {"pressed-1", "pressed-2", "next"}
 
 
 def test_with_one_device_all_are_made_here_one_after_the_other(tmp_path: Path) -> None:

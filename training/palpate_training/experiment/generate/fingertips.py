@@ -1,12 +1,13 @@
 """An experiment on several fingertips: dealt to them, and made on several devices at a time.
 
-The processes of a fingertip's devices begin and end with it, and its trials need cores alone. So a
-device has a fingertip of its own: while one is begun or its trials are made, others are pressed.
+The processes of a fingertip's devices begin and end with it, and its trials need cores alone. So
+each device presses a fingertip of its own, and the next one as soon as that is done.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import threading
 from collections import deque
@@ -22,6 +23,7 @@ from typing import Any, Generic, TypeVar
 from palpate.cluster import WorkerLostError
 from palpate.errors import ConfigError, PalpateError
 from palpate_training.experiment.generate.pipeline import (
+    MECHANICS,
     GeneratedExperiment,
     OnStage,
     generate,
@@ -32,9 +34,12 @@ from palpate_training.experiment.generate.simulator import (
     Specimen,
     TwinSimulator,
 )
-from palpate_training.experiment.generate.workers import end_with_parent
+from palpate_training.experiment.generate.workers import end_with_parent, limit_threads
 
 _SEEDS = 1000  # of one experiment on several fingertips; presses are a function of the seed
+
+_AHEAD = 2
+"""Fingertips for each device: one is pressed while the trials of another are made."""
 
 _POLL_S = 0.2
 """Longest time until progress is shown, or a request to stop is passed on [s]."""
@@ -107,7 +112,7 @@ class SharedExperiment(Generic[Summary]):
         workers: Processes, of all that are made at a time.
         threads: Threads of each solver.
         ray: Address of a Ray cluster, all of which works on one fingertip at a time.
-        devices: Devices of this host; each has a fingertip of its own.
+        devices: Devices of this host; each presses a fingertip of its own.
         slots: Trajectories at once on each.
         command: For provenance.
     """
@@ -190,39 +195,42 @@ class SharedExperiment(Generic[Summary]):
     def _several(
         self, shares: Sequence[FingertipShare], stop: threading.Event, on_stage: OnShareStage
     ) -> Iterator[tuple[FingertipShare, Summary]]:
-        """Make as many at a time as there are devices, in a process for each.
+        """Make several at a time, each in a process: as many are pressed as there are devices.
 
         Threads would share the kernels of the host, whose library is not made for that.
         """
-        # Some are pressed while others need the cores, so half of all are enough for those.
-        workers = max(1, min(self.workers, 2 * self.workers // len(self.devices)))
-        makers = [_Maker(self, device, workers) for device in self.devices[: len(shares)]]
-        idle, waiting = list(makers), deque(shares)
+        makers: list[_Maker] = []
+        idle: list[_Maker] = []
+        free, waiting = deque(self.devices), deque(shares)
         failure: PalpateError | None = None
         try:
-            while makers:
+            while waiting or makers:
                 if stop.is_set() or failure is not None:
                     waiting.clear()
                     for maker in makers:
                         maker.end()
-                while idle:
-                    maker = idle.pop()
-                    if waiting:
-                        maker.give(waiting.popleft())
-                    else:
-                        maker.close()
-                        makers.remove(maker)
+                while waiting and free and (idle or len(makers) < _AHEAD * len(self.devices)):
+                    if not idle:
+                        idle.append(_Maker(self))
+                        makers.append(idle[-1])
+                    idle.pop().give(waiting.popleft(), free.popleft())
+                while idle and not waiting:
+                    makers.remove(idle[-1])
+                    idle.pop().close()
                 for maker in _with_news(makers):
                     news = maker.news()
+                    pressing = isinstance(news, tuple) and news[1] == MECHANICS
+                    if not pressing and maker.device is not None:
+                        free.append(maker.device)
+                        maker.device = None
+                    if isinstance(news, tuple):
+                        on_stage(*news)
+                        continue
+                    idle.append(maker)
                     if isinstance(news, PalpateError):
                         failure = failure or news
-                        idle.append(maker)
-                    elif isinstance(news, _Made):
-                        idle.append(maker)
-                        if news.summary is not None:
-                            yield maker.share, news.summary
-                    else:
-                        on_stage(*news)
+                    elif news.summary is not None:
+                        yield maker.share, news.summary
         finally:
             for maker in makers:
                 maker.close()
@@ -238,27 +246,31 @@ class _Made:
 
 
 class _Maker:
-    """A process that makes experiments on one device, one after the other.
+    """A process that makes experiments, one after the other.
 
     It is told by a pipe of its own: of one that is killed nothing is left that others wait for.
+
+    Attributes:
+        link: Its end of that pipe.
+        share: What it makes, or has made last.
+        device: What presses it; None = it is pressed.
     """
 
     share: FingertipShare
+    device: str | None = None
 
-    def __init__(self, experiment: SharedExperiment[Any], device: str, workers: int) -> None:
+    def __init__(self, experiment: SharedExperiment[Any]) -> None:
         context = get_context("spawn")
         self.link, theirs = context.Pipe()
         self._ending = False
-        self._process = context.Process(
-            target=_make, args=(experiment, device, workers, theirs), name=f"fingertips {device}"
-        )
+        self._process = context.Process(target=_make, args=(experiment, theirs), name="fingertips")
         self._process.start()
         theirs.close()
 
-    def give(self, share: FingertipShare) -> None:
+    def give(self, share: FingertipShare, device: str) -> None:
         """Let it make an experiment."""
-        self.share = share
-        self._send(share)
+        self.share, self.device = share, device
+        self._send((share, device))
 
     def end(self) -> None:
         """Let it stop; may be called again."""
@@ -281,7 +293,7 @@ class _Maker:
         self.link.close()
         self._process.join()
 
-    def _send(self, message: FingertipShare | None) -> None:
+    def _send(self, message: tuple[FingertipShare, str] | None) -> None:
         with contextlib.suppress(OSError):  # it died, which its news will be
             self.link.send(message)
 
@@ -291,27 +303,32 @@ def _with_news(makers: Sequence[_Maker]) -> list[_Maker]:
     return [maker for maker in makers if maker.link in ready]
 
 
-def _make(experiment: SharedExperiment[Any], device: str, workers: int, link: Connection) -> None:
+def _make(experiment: SharedExperiment[Any], link: Connection) -> None:
     """Make the experiments that come, until None comes or nobody is there any more."""
     for number in (signal.SIGINT, signal.SIGTERM):  # those to the whole group are the command's
         signal.signal(number, lambda *_: None)  # unlike SIG_IGN not for processes that begin here
     end_with_parent()
-    stop, shares = threading.Event(), SimpleQueue[FingertipShare | None]()
+    # While some are pressed others need the cores, about as many as there are devices. More threads
+    # than cores wait for each other: three fits of bases at once took 162 s on two cores for 57 s.
+    at_once = len(experiment.devices)
+    limit_threads(max(1, (os.cpu_count() or 1) // at_once))
+    workers = max(1, min(experiment.workers, _AHEAD * experiment.workers // at_once))
+    stop, orders = threading.Event(), SimpleQueue[tuple[FingertipShare, str] | None]()
 
     def listen() -> None:
-        share: FingertipShare | None
         while True:
             try:
-                share = link.recv()
+                order = link.recv()
             except (EOFError, OSError):
-                share = None
-            shares.put(share)
-            if share is None:
+                order = None
+            orders.put(order)
+            if order is None:
                 stop.set()
                 return
 
-    threading.Thread(target=listen, name="shares", daemon=True).start()
-    while (share := shares.get()) is not None:
+    threading.Thread(target=listen, name="orders", daemon=True).start()
+    while (order := orders.get()) is not None:
+        share, device = order
         tell = partial(_tell, link, share.name)
         try:
             link.send(_Made(experiment.one(share, (device,), workers, stop, tell)))

@@ -45,6 +45,9 @@ IDLE_LENGTH_S = 180.0
 IDLE_SINCE_ON_S = 300.0
 """Age of a sensor when it is looked at [s]: the idle real ones were still warming up."""
 
+MECHANICS = "mechanics"
+"""The first stage, which devices can do."""
+
 OnStage = Callable[[str, int, int, str], None]
 """Called with the stage, how many are done, of how many, and a word on them."""
 
@@ -127,12 +130,12 @@ def generate(
             workers=workers,
             threads=threads,
             stop=stop,
-            on_progress=partial(on_stage, "mechanics"),
+            on_progress=partial(on_stage, MECHANICS),
             devices=devices,
             slots=slots,
             cluster=cluster,
         )
-        seconds["mechanics"] = time.monotonic() - began
+        seconds[MECHANICS] = time.monotonic() - began
         if not complete:
             return None
         store = simulator.open_store(path)

@@ -43,8 +43,13 @@ def begin_worker() -> None:
     # Ctrl-C is for the command. A worker that it ended would look as if memory had run out.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
+    limit_threads(1)
+
+
+def limit_threads(count: int) -> None:
+    """Let products of matrices in this process use so many threads at most."""
     importlib.import_module("scipy.linalg")  # brings a linear algebra of its own, as NumPy does
-    require("threadpoolctl", extra="training").threadpool_limits(1)
+    require("threadpoolctl", extra="training").threadpool_limits(count)
 
 
 def end_with_parent() -> None:
