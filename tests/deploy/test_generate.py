@@ -370,6 +370,28 @@ def test_trials_are_done_though_no_specimen_met_an_indenter(tmp_path: Path) -> N
     assert [name.split("/")[0] for name in done.data.experiment.trajectories] == ["sphere_medium"]
 
 
+def test_it_stops_while_data_sets_are_made_and_goes_on(
+    tmp_path: Path, generated: GeneratedExperiment
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(generated.folder, folder)
+    (folder / MIXED).unlink()
+    stop = threading.Event()
+
+    def on_stage(stage: str, done: int, total: int, word: str) -> None:
+        if stage == "data sets":
+            stop.set()
+
+    stopped = generate(
+        folder, SPEC, specimens(), FemSimulator(), workers=1, stop=stop, on_stage=on_stage
+    )
+    assert stopped is None
+    assert {path.name for path in folder.iterdir()} == {
+        path.name for path in generated.folder.iterdir() if path.name != MIXED
+    }
+    assert run(folder).data.mixed.experiment.trials == generated.data.mixed.experiment.trials
+
+
 def test_what_trials_need_is_missed_before_anything_is_simulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

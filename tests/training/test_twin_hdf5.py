@@ -154,6 +154,8 @@ def test_the_other_schema_and_a_missing_file_are_named(mixed_path: Path, path: P
         read_experiment(mixed_path)
     with pytest.raises(DatasetError, match="no such file"):
         read_mixed(path.with_name("none.h5"))
+    with pytest.raises(DatasetError, match=f"is a folder.* in it: .*{path.name}"):
+        read_mixed(path.parent)
 
 
 def test_an_interrupted_write_leaves_the_old_file(

@@ -135,6 +135,13 @@ def test_axes_that_are_none_are_refused(folder: Path, axes: tuple[str, ...], wor
         read_published(folder, axes=axes)
 
 
+def test_a_folder_of_another_data_set_says_which_files_can_be_named(tmp_path: Path) -> None:
+    (tmp_path / "fingertip-01").mkdir()
+    (tmp_path / "fingertip-01" / "mixed.h5").touch()
+    with pytest.raises(DatasetError, match=r"none of the published .* in it: fingertip-01/mixed"):
+        read_published(tmp_path)
+
+
 def test_a_partial_set_must_be_asked_for(folder: Path) -> None:
     (folder / "biotac2.hdf5").unlink()
     with pytest.raises(DatasetError, match=r"biotac2.hdf5 is missing.*\[1, 3\]"):

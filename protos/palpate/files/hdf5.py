@@ -86,6 +86,15 @@ def h5py_module(extra: str) -> ModuleType:
     return require("h5py", extra=extra)
 
 
+def name_a_file(folder: Path) -> str:
+    """What to do where a folder was given and not a file: name one, e.g. of those that it holds."""
+    found = sorted(
+        str(one.relative_to(folder)) for at in ("*.h5", "*/*.h5") for one in folder.glob(at)
+    )
+    shown = [*found[:4], "..."] if len(found) > 4 else found
+    return f"name a file in it: {', '.join(shown)}" if shown else "name a file"
+
+
 @contextlib.contextmanager
 def opened(
     path: Path, *, extra: str, missing: str = "check the path, or make the file"
@@ -97,6 +106,8 @@ def opened(
         MissingExtraError: h5py is not installed; ``extra`` of palpate installs it.
     """
     h5 = h5py_module(extra)
+    if path.is_dir():
+        raise DatasetError(f"{path} is a folder", remedy=name_a_file(path))
     if not path.is_file():
         raise DatasetError(f"{path}: no such file", remedy=missing)
     try:

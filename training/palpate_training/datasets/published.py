@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from palpate import __version__
 from palpate.errors import DatasetError
-from palpate.files.hdf5 import opened, text
+from palpate.files.hdf5 import name_a_file, opened, text
 from palpate.process import require
 from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.container import Provenance
@@ -125,6 +125,11 @@ def _present(folder: Path, units: Sequence[int] | None) -> list[int]:
     missing = [name for name in missing if not (folder / name).is_file()]
     if missing or not wanted:
         there = [unit for unit in UNITS if published_file(folder, unit).is_file()]
+        if units is None and not there:
+            raise DatasetError(
+                f"{folder} holds none of the published files {', '.join(missing)}",
+                remedy=f"download them; or, of another data set, {name_a_file(folder)}",
+            )
         raise DatasetError(
             f"{folder}: {', '.join(missing) or 'no unit'} is missing",
             remedy=f"download it, or choose among the units that are there: {there or 'none'}",

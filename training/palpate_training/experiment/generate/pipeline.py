@@ -25,6 +25,7 @@ from palpate_training.datasets.experiment import write_experiment, write_mixed
 from palpate_training.experiment.generate.data_sets import AssembledSets, assemble
 from palpate_training.experiment.generate.simulator import (
     ExperimentSpec,
+    OnProgress,
     PressedSpecimens,
     Specimen,
     TwinSimulator,
@@ -69,6 +70,10 @@ class GeneratedExperiment:
     provenance_sha256: str
     seconds: dict[str, float]
     bytes: dict[str, int]
+
+
+class _StoppedError(Exception):
+    """The data sets were being made when it was asked to stop."""
 
 
 def generate(
@@ -154,7 +159,17 @@ def generate(
             return None
         seconds["trials"] = time.monotonic() - began
         began = time.monotonic()
-        data, digest = _assemble(folder, spec, specimens, simulator, processes, on_stage, command)
+
+        def on_progress(done: int, total: int, word: str) -> None:
+            if stop.is_set():
+                raise _StoppedError
+            on_stage("data sets", done, total, word)
+
+        data, digest = _assemble(
+            folder, spec, specimens, simulator, processes, on_progress, command
+        )
+    except _StoppedError:
+        return None
     except WorkerLostError:
         if not stop.is_set():
             raise
@@ -178,7 +193,7 @@ def _assemble(
     specimens: Sequence[Specimen],
     simulator: TwinSimulator,
     processes: WorkerProcesses,
-    on_stage: OnStage,
+    on_progress: OnProgress,
     command: str,
 ) -> tuple[AssembledSets, str]:
     """Both data sets, and the digest of all that decides their rows."""
@@ -202,7 +217,7 @@ def _assemble(
         names,
         provenance,
         clearance_m=simulator.clearance_m,
-        on_progress=partial(on_stage, "data sets"),
+        on_progress=on_progress,
         open_store=simulator.open_store,
         runner=processes,
     )
