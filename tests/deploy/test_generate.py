@@ -21,7 +21,7 @@ from palpate.cluster import RayCluster, WorkerLostError
 from palpate.errors import ConfigError, DatasetError, LinkError, MissingExtraError
 from palpate.files.tape import read_tape
 from palpate_deploy.cli.data import twin_app
-from palpate_deploy.experiment import FemSimulator, specimens_of
+from palpate_deploy.experiment import FemSimulator, specimens_of, with_indenters_met
 from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.population.members import PAPER, Member, draw_members, write_population
 from palpate_fem.store.read import SimulationStore
@@ -342,18 +342,13 @@ def test_fingertips_have_skins_presses_and_specimens_of_their_own(tmp_path: Path
 
 
 def test_indenters_that_no_specimen_was_pressed_with_are_left_out(tmp_path: Path) -> None:
-    """The published biotac-1 met spheres alone, and has a fingertip of its own here."""
-    out = tmp_path / "several"
-    words = ["generate", str(out), "--random", "4", "--fingertips", "2", "--edge-mm", "1.2"]
-    words += ["--layers", "1", "--indenter", "cube", "--indenter", "sphere_medium"]
-    done = CliRunner().invoke(twin_app, [*words, "--workers", "1", "--json"])
-    assert done.exit_code == 0, done.output
-    for number, shapes in enumerate((["sphere_medium"], ["cube", "sphere_medium"]), start=1):
-        folder = out / f"fingertip-{number:02d}"
-        assert json.loads((folder / SPEC_FILE).read_text())["spec"]["indenters"] == shapes
-        ids = SimulationStore.open(folder / STORE).ids()
-        assert sorted({name.split("/")[0] for name in ids}) == shapes
-        assert len(ids) == 2
+    """The published biotac-1 met spheres alone."""
+    spheres, every = specimens()
+    random = ExperimentSpec(presses=9)
+    named = with_indenters_met(random, (spheres,)).indenters
+    assert {name.split("_")[0] for name in named} == {"sphere"}
+    assert len(named) == 5  # sizes between the nine's, too
+    assert with_indenters_met(random, (spheres, every)) == random
     units, no = tmp_path / "spheres.json", tmp_path / "no"
     write_population(units, members()[:1], source="published")
     words = ["generate", str(no), "--points", "1", "--indenter", "cube", "--units", str(units)]

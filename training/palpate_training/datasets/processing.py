@@ -99,15 +99,16 @@ def filter_force(raw: RawTrial) -> RawTrial:
         )
     sections = signal.butter(1, CUTOFF_HZ, fs=rate_hz, output="sos")
     padding = round(PADDING_S * rate_hz)
-    dwells = np.split(raw.force, raw.increment_end + 1)  # and what follows the last increment
-    filtered = [
-        signal.sosfiltfilt(
-            sections, dwell, axis=0, padtype="even", padlen=min(padding, len(dwell) - 1)
+    # The first and what follows each end; those of one length at once, as there are many.
+    starts = np.array([0, *(raw.increment_end + 1)])
+    lengths = np.diff(starts, append=len(raw.force))
+    force = np.empty_like(raw.force)
+    for length in set(lengths.tolist()) - {0}:
+        rows = starts[lengths == length][:, None] + np.arange(length)
+        force[rows] = signal.sosfiltfilt(
+            sections, raw.force[rows], axis=1, padtype="even", padlen=min(padding, length - 1)
         )
-        for dwell in dwells
-        if len(dwell)
-    ]
-    return replace(raw, force=np.concatenate(filtered))
+    return replace(raw, force=force)
 
 
 def last_of_increments(raw: RawTrial) -> RawTrial:
