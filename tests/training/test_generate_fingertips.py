@@ -14,6 +14,7 @@ import pytest
 
 from palpate.cluster import WorkerLostError
 from palpate.errors import DatasetError
+from palpate_training.experiment.generate import fingertips
 from palpate_training.experiment.generate.fingertips import FingertipShare, SharedExperiment
 from palpate_training.experiment.generate.pipeline import OnStage
 from palpate_training.experiment.generate.simulator import ExperimentSpec, TwinSimulator
@@ -49,6 +50,8 @@ class Scripted(SharedExperiment[str]):
             os.kill(os.getpid(), signal.SIGKILL)
         if "long" in share.name and stop.wait(LONG_S):
             return None
+        if "hanging" in share.name:
+            os.kill(os.getpid(), signal.SIGSTOP)
         if "signalled" in share.name:  # as every process of a group is
             os.kill(os.getpid(), signal.SIGTERM)
             os.kill(os.getpid(), signal.SIGINT)
@@ -127,6 +130,19 @@ def test_stopped_they_end_early_and_are_not_told_as_made(tmp_path: Path) -> None
     assert [share.name for share, _ in experiment.made(shares(*names), stop, on_stage)] == ["a"]
     assert time.monotonic() - began < LONG_S
     assert not (tmp_path / "never.begun").exists()
+
+
+def test_one_that_hangs_does_not_keep_a_stop_waiting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fingertips, "_END_S", 0.5)
+    stop, experiment = threading.Event(), scripted(tmp_path, "cuda:0", "cuda:1")
+
+    def on_stage(name: str, *_: object) -> None:
+        if name == "hanging":
+            stop.set()
+
+    assert not list(experiment.made(shares("long", "hanging"), stop, on_stage))
 
 
 def test_who_asks_for_no_more_ends_them(tmp_path: Path) -> None:

@@ -7,9 +7,11 @@ each device presses a fingertip of its own, and the next one as soon as that is 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -43,6 +45,9 @@ _AHEAD = 2
 
 _POLL_S = 0.2
 """Longest time until progress is shown, or a request to stop is passed on [s]."""
+
+_END_S = 10.0
+"""Time for a process to stop [s]; one that fits bases does not look, one that hangs never does."""
 
 OnShareStage = Callable[[str, str, int, int, str], None]
 """Called with the name of a share, and the progress of a stage as `OnStage` has it."""
@@ -203,12 +208,16 @@ class SharedExperiment(Generic[Summary]):
         idle: list[_Maker] = []
         free, waiting = deque(self.devices), deque(shares)
         failure: PalpateError | None = None
+        end_at = math.inf
         try:
             while waiting or makers:
-                if stop.is_set() or failure is not None:
+                if end_at == math.inf and (stop.is_set() or failure is not None):
+                    end_at = time.monotonic() + _END_S
                     waiting.clear()
                     for maker in makers:
                         maker.end()
+                if time.monotonic() > end_at:
+                    break
                 while waiting and free and (idle or len(makers) < _AHEAD * len(self.devices)):
                     if not idle:
                         idle.append(_Maker(self))
@@ -233,7 +242,9 @@ class SharedExperiment(Generic[Summary]):
                         yield maker.share, news.summary
         finally:
             for maker in makers:
-                maker.close()
+                maker.link.close()
+            for maker in makers:
+                maker.close(max(0.0, min(end_at - time.monotonic(), _END_S)))
         if failure is not None:
             raise failure
 
@@ -262,7 +273,6 @@ class _Maker:
     def __init__(self, experiment: SharedExperiment[Any]) -> None:
         context = get_context("spawn")
         self.link, theirs = context.Pipe()
-        self._ending = False
         self._process = context.Process(target=_make, args=(experiment, theirs), name="fingertips")
         self._process.start()
         theirs.close()
@@ -274,9 +284,7 @@ class _Maker:
 
     def end(self) -> None:
         """Let it stop; may be called again."""
-        if not self._ending:
-            self._ending = True
-            self._send(None)
+        self._send(None)
 
     def news(self) -> Any:
         """Wait for arguments of `OnShareStage`, an experiment's end, or the error that ended it."""
@@ -288,9 +296,11 @@ class _Maker:
                 remedy="give it more memory, or name fewer devices; run again, it goes on",
             )
 
-    def close(self) -> None:
-        """Let it stop, and wait for it."""
+    def close(self, patience_s: float = _END_S) -> None:
+        """Let it stop, and end it if it takes long: its files appear whole or not at all."""
         self.link.close()
+        self._process.join(patience_s)
+        self._process.kill()  # its own processes end with it
         self._process.join()
 
     def _send(self, message: tuple[FingertipShare, str] | None) -> None:
