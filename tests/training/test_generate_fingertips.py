@@ -88,16 +88,20 @@ def test_all_are_made_each_on_one_device_with_progress(tmp_path: Path) -> None:
         assert (tmp_path / f"{name}.begun").read_text() in ("cuda:0", "cuda:1")
 
 
-def test_a_device_presses_the_next_while_trials_are_made(tmp_path: Path) -> None:
-    """Both devices are free though what they have pressed is not done."""
-    experiment = scripted(tmp_path, "cuda:0", "cuda:1")
-    found = experiment.made(shares("pressed-1", "pressed-2", "next"), threading.Event())
-    assert {share.name for share, _ in found} == {"pressed-1", "pressed-2", "next"}
+@pytest.mark.parametrize("devices", [("cuda:0",), ("cuda:0", "cuda:1")])
+def test_a_device_presses_the_next_while_trials_are_made(
+    tmp_path: Path, devices: tuple[str, ...]
+) -> None:
+    """All devices are free though what they have pressed is not done."""
+    names = {*(f"pressed-{device[-1]}" for device in devices), "next"}
+    found = scripted(tmp_path, *devices).made(
+        shares(*sorted(names, reverse=True)), threading.Event()
+    )
+    assert {share.name for share, _ in found} == names
 
 
-def test_with_one_device_all_are_made_here_one_after_the_other(tmp_path: Path) -> None:
-    experiment = scripted(tmp_path, "cuda:0")
-    found = experiment.made(shares("a", "b"), threading.Event())
+def test_without_devices_all_are_made_here_one_after_the_other(tmp_path: Path) -> None:
+    found = scripted(tmp_path).made(shares("a", "b"), threading.Event())
     assert [summary for _, summary in found] == ["a: 6 workers", "b: 6 workers"]
 
 

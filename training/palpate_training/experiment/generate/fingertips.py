@@ -161,7 +161,7 @@ class SharedExperiment(Generic[Summary]):
                 yield share, None
             else:
                 left.append(share)
-        if self.ray is None and min(len(left), len(self.devices)) > 1:
+        if self.ray is None and self.devices and len(left) > 1:
             yield from self._several(left, stop, on_stage)
             return
         for share in left:
