@@ -198,9 +198,9 @@ def test_one_that_is_full_is_not_the_last_that_is_asked(own_bus: LinkConfig) -> 
         until(lambda: holders(robot.session) == ["fem-a", "fem-b"])
         until(lambda: sum(a.service == "fem" and a.ready for a in robot.alive()) == 2)
         first = Asked(robot, "first")
-        assert first.begun.wait(PATIENCE_S)
+        assert first.begun.wait(PATIENCE_S), first.answer
         second = Asked(robot, "second")
-        assert second.begun.wait(PATIENCE_S)
+        assert second.begun.wait(PATIENCE_S), (second.answer, robot.status())
         with pytest.raises(RemoteError, match="wait"):
             robot.simulate(fakes.request("third"), timeout_s=10.0)
         for name in ("first", "second"):  # whichever of the two computes it
