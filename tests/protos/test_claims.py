@@ -10,12 +10,14 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from palpate.bus import SensorClaims, Session, run_router
 from palpate.bus.claims import YIELD_S
-from palpate.bus.topics import SensorClaim, claim_key
+from palpate.bus.topics import CLAIM_ROOT, SensorClaim, claim_key
 from palpate.config import LinkConfig
 from palpate.errors import ClaimedElsewhere, SensorTaken
 
@@ -59,6 +61,34 @@ def refusal_of(claims: SensorClaims) -> ClaimedElsewhere:
         assert time.monotonic() < deadline, "it was not refused"
         time.sleep(0.01)
     return refusal
+
+
+class KnowsNobody:
+    """The Zenoh session of a peer whose links to others have not come up."""
+
+    def __init__(self, session: Any) -> None:
+        self._session = session
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._session, name)
+
+    def liveliness(self) -> Any:
+        return SimpleNamespace(get=lambda *_, **__: iter(()))
+
+
+def test_holders_are_known_though_links_to_them_come_up_late(
+    link: LinkConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was old enough to know them, and looked at its own view alone: nobody held anything."""
+    monkeypatch.setattr("palpate.bus.link._YOUNG_S", 0.0)
+    with claims_of(link, 20) as claims, Session.open(link) as looking:
+        assert held_within_patience(claims)
+        monkeypatch.setattr(looking, "_raw", KnowsNobody(looking._raw))
+        deadline = time.monotonic() + PATIENCE_S
+        while not (found := looking.holders(CLAIM_ROOT, "finger")):
+            assert time.monotonic() < deadline, "nobody holds it"
+            time.sleep(0.01)
+        assert [one.instance for one in found] == ["gateway-20"]
 
 
 def test_the_second_is_refused_and_told_who_is_first(link: LinkConfig) -> None:

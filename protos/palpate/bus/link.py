@@ -567,13 +567,17 @@ class Session(Closing):
         )
 
     def holders(self, root: str, sensor: str) -> list[SensorClaim]:
-        """Who holds a claim on a sensor of this station, in order of their instances."""
+        """Who holds a claim on a sensor of this station, in order of their instances.
+
+        Complete as `alive` is: links to others come up late on a busy host.
+        """
         key = claims_key(self.station, sensor, held_only=True, root=root)
-        found = []
-        for reply in self._asking().liveliness().get(key, timeout=_LOOK_S):
-            if reply.ok is not None:
-                with contextlib.suppress(WireError):  # anybody may declare tokens
-                    found.append(parse_claim_key(str(reply.ok.key_expr)))
+        found = set()
+        for view in self._views():
+            for reply in view.liveliness().get(key, timeout=_LOOK_S):
+                if reply.ok is not None:
+                    with contextlib.suppress(WireError):  # anybody may declare tokens
+                        found.add(parse_claim_key(str(reply.ok.key_expr)))
         return sorted(found, key=lambda one: one.instance)
 
     def alive(self, *, station: str | None = None) -> list[AliveService]:
@@ -582,13 +586,16 @@ class Session(Closing):
         A peer learns of the others while its links to them come up, and the router knows them all.
         Without the router it is what this session has learned.
         """
-        where = self.station if station is None else station
+        return alive(self._views(), self.station if station is None else station)
+
+    def _views(self) -> list[zenoh.Session]:
+        """Sessions that together know the tokens of all."""
         views = [self._raw]
         with contextlib.suppress(LinkError):  # the router is gone
             observer = self.observer()
             if observer is not self:
                 views.append(observer._raw)
-        return alive(views, where)
+        return views
 
     def observer(self) -> Session:
         """A session through which questions reach every process of the station at once.
