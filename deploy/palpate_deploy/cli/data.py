@@ -185,7 +185,7 @@ def data_generate(
             "--device",
             metavar="NAME",
             help="Solve many trajectories at once on this device: cuda:0, ..., or cpu; repeatable. "
-            "With --fingertips each named one has a fingertip of its own at a time; with --ray: "
+            "With --fingertips each presses a fingertip of its own; with --ray: "
             "cuda = on each GPU of the cluster.",
         ),
     ] = None,

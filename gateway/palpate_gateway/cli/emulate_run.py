@@ -15,9 +15,9 @@ from rich.live import Live
 from rich.text import Text
 
 from palpate.errors import ConfigError, DeviceError, LinkError
+from palpate.process import until_signal
 from palpate_gateway.cli.emulate_devices import EmulatedDevice
 from palpate_gateway.cli.key_values import command_words, sensor_toml
-from palpate_gateway.cli.signals import until_signal
 
 _TICK_S = 0.02
 _SHOW_S = 0.5

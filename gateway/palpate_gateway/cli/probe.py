@@ -18,8 +18,8 @@ from rich.table import Table
 from rich.text import Text
 
 from palpate.errors import DeviceError, DeviceTimeout
+from palpate.process import until_signal
 from palpate_gateway.cli.key_values import parse_key_values, text_keys
-from palpate_gateway.cli.signals import until_signal
 from palpate_gateway.cli.streams import DeviceStream, DeviceStreams, measure, text_of, values_of
 from palpate_gateway.device import Device
 from palpate_gateway.drivers import load_driver, make_device

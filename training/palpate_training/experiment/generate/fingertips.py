@@ -319,7 +319,7 @@ def _make(experiment: SharedExperiment[Any], link: Connection) -> None:
         signal.signal(number, lambda *_: None)  # unlike SIG_IGN not for processes that begin here
     end_with_parent()
     # While some are pressed others need the cores, about as many as there are devices. More threads
-    # than cores wait for each other: three fits of bases at once took 162 s on two cores for 57 s.
+    # than cores wait for each other: three fits of bases on two cores took 162 s, not 57 s.
     at_once = len(experiment.devices)
     limit_threads(max(1, (os.cpu_count() or 1) // at_once))
     workers = max(1, min(experiment.workers, _AHEAD * experiment.workers // at_once))
