@@ -82,7 +82,7 @@ def test_all_are_made_each_on_one_device_with_progress(tmp_path: Path) -> None:
         shares("a", "b", "signalled", "c", "d"), threading.Event(), lambda *one: told.append(one)
     )
     summaries = {share.name: summary for share, summary in found}
-    assert summaries == {n: f"{n}: 4 workers" for n in ("a", "b", "signalled", "c", "d")}
+    assert summaries == {n: f"{n}: 2 workers" for n in ("a", "b", "signalled", "c", "d")}
     assert sorted(told) == [(n, "mechanics", 1, 2, n) for n in ("a", "b", "c", "d", "signalled")]
     for name in summaries:
         assert (tmp_path / f"{name}.begun").read_text() in ("cuda:0", "cuda:1")

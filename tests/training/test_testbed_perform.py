@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from palpate.errors import ConfigError
+from palpate_training.datasets.processing import filter_force, last_of_increments
 from palpate_training.datasets.trials import RawTrial, TrialHeader
 from palpate_training.experiment.virtual_testbed import WrenchSensor, contact_travel, perform
 
@@ -57,6 +58,27 @@ def test_a_trial_is_the_whole_schedule() -> None:
     assert trial.travel_m[0] == 0
     assert trial.electrodes.dtype == np.uint16
     assert trial.header == HEADER
+
+
+def test_last_samples_alone_are_those_of_the_whole_trial() -> None:
+    """Electrodes that creep, and a force with noise."""
+    readings: list[int] = []
+
+    def read(ideal: Floats, time_s: Floats) -> npt.NDArray[np.uint16]:
+        readings.append(len(time_s))
+        followed = ideal.copy()
+        ways = np.exp(-np.diff(time_s, prepend=time_s[0]) / 15.0)[:, None]
+        for k in range(1, len(ideal)):
+            followed[k] = ideal[k] + (followed[k - 1] - ideal[k]) * ways[k]
+        return read_plainly(0.8 * ideal + 0.2 * followed, time_s)
+
+    def played(**how: Any) -> RawTrial:
+        return play(read_electrodes=read, sensor=None, repeatability_m=2e-5, seed=4, **how)
+
+    last, whole = played(last_only=True), last_of_increments(filter_force(played()))
+    for name in ("time_s", "electrodes", "force", "tip", "travel_m", "increment_end"):
+        np.testing.assert_array_equal(getattr(last, name), getattr(whole, name), err_msg=name)
+    assert readings[0] < readings[1] / 10, "read in dwells"
 
 
 def test_before_contact_there_is_nothing_and_the_tip_comes_straight() -> None:

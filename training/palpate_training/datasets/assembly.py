@@ -71,7 +71,7 @@ def mix(rows: TrialRows, simulated: SimulatedTrial, count: int = INCREMENTS) -> 
             f"{name}: the simulation is of {simulated.trajectory}",
             remedy="mix a trial with the simulation of its own trajectory",
         )
-    travel_m, force, displacement, contact_force = _aligned(name, simulated)
+    travel_m, force, displacement, contact_force, shares = _aligned(name, simulated)
     final_m = min(float(rows.travel_m[-1]), float(travel_m[-1]))
     if final_m <= 0.0:
         short = "experiment" if len(rows.travel_m) < 2 else "simulation"
@@ -92,6 +92,7 @@ def mix(rows: TrialRows, simulated: SimulatedTrial, count: int = INCREMENTS) -> 
         simulated_force=interpolate(at_m, travel_m, force),
         displacement=interpolate(at_m, travel_m, displacement),
         contact_force=None if contact_force is None else interpolate(at_m, travel_m, contact_force),
+        shares=interpolate(at_m, travel_m, shares),
     )
 
 
@@ -112,8 +113,8 @@ def interpolate(at: Floats, where: Floats, values: Values) -> Values:
 
 def _aligned(
     name: str, simulated: SimulatedTrial
-) -> tuple[Floats, Floats, FloatArray, FloatArray | None]:
-    """Travel since 0.5 N, force and fields of the steps before the divergence."""
+) -> tuple[Floats, Floats, FloatArray, FloatArray | None, Floats]:
+    """Travel since 0.5 N, force, fields and shares of the steps before the divergence."""
     believed = slice(0, simulated.converged)
     force = simulated.force[believed]
     if not (np.isfinite(force).all() and np.isfinite(simulated.displacement[believed]).all()):
@@ -143,7 +144,8 @@ def _aligned(
     displacement = start.rows(simulated.displacement[believed])
     contact = simulated.contact_force
     contact_force = None if contact is None else start.rows(contact[believed])
-    return travel_m - travel_m[0], start.rows(force), displacement, contact_force
+    shares = start.rows(np.eye(len(force)))
+    return travel_m - travel_m[0], start.rows(force), displacement, contact_force, shares
 
 
 def assemble_experiment(
@@ -208,6 +210,19 @@ class EncodedTrial:
     contact: tuple[FloatArray, FloatArray, FloatArray] | None
 
 
+@dataclass(frozen=True, slots=True)
+class StepCoefficients:
+    """Coefficients of a simulation's steps, not rounded.
+
+    Attributes:
+        displacement: Shape (S, K).
+        contact_force: Shape (S, F); None where these are left out.
+    """
+
+    displacement: Floats
+    contact_force: Floats | None
+
+
 class TrialEncoder:
     """Trials with fields to trials with coefficients; made once for many, as `FieldEncoder` is.
 
@@ -223,23 +238,53 @@ class TrialEncoder:
         self.displacement = FieldEncoder(basis)
         self.contact_force = None if contact_basis is None else FieldEncoder(contact_basis)
 
-    def __call__(self, mixed: MixedRows) -> EncodedTrial:
+    def steps(self, simulated: SimulatedTrial) -> StepCoefficients:
+        """Coefficients of a simulation's steps, of which those of its trials' rows are made.
+
+        Raises:
+            DatasetError: Its fields are of another mesh.
+        """
+        found, expected = simulated.displacement.shape[1:], self._mesh.nodes.shape
+        if found != expected:
+            raise DatasetError(
+                f"{simulated.trajectory}: displacement has shape {found}, expected {expected}",
+                remedy="simulate with the mesh that the data set names",
+            )
+        before, contact = slice(0, simulated.converged), None
+        if self.contact_force is not None and simulated.contact_force is not None:
+            contact = self.contact_force.exact(simulated.contact_force[before])
+        return StepCoefficients(self.displacement.exact(simulated.displacement[before]), contact)
+
+    def __call__(self, mixed: MixedRows, steps: StepCoefficients | None = None) -> EncodedTrial:
         """Check and encode a trial.
+
+        Args:
+            mixed: The trial.
+            steps: Of its simulation, which saves most of the work: rows lie between steps, and so
+                do their coefficients.
 
         Raises:
             DatasetError: A field is of another mesh or not finite, or a row is not in contact.
         """
         _check_fields(mixed, self._mesh, contact=self.contact_force is not None)
+        if steps is None or mixed.shares is None:
+            moved = self.displacement.exact(mixed.displacement)
+        else:
+            moved = mixed.shares @ steps.displacement
         contact = None
         if self.contact_force is not None and mixed.contact_force is not None:
+            if steps is None or mixed.shares is None or steps.contact_force is None:
+                pressed = self.contact_force.exact(mixed.contact_force)
+            else:
+                pressed = mixed.shares @ steps.contact_force
             contact = (
                 *contact_of(self._mesh, mixed.displacement, mixed.contact_force),
-                self.contact_force(mixed.contact_force),
+                self.contact_force.stored(pressed),
             )
         return EncodedTrial(
             mixed.rows,
             mixed.simulated_force.astype(np.float32),
-            self.displacement(mixed.displacement),
+            self.displacement.stored(moved),
             contact,
         )
 

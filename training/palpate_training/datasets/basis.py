@@ -17,7 +17,6 @@ import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -54,8 +53,11 @@ _ROUNDING = 0.02
 _SOME_ROWS = 512
 """Rows that say how many modes are about enough."""
 
-_ROWS = 200
+_ROWS = 400
 """Rows that a block read from disk has at least: products of few rows use half of a processor."""
+
+_AT_ONCE = 100
+"""Rows that are compressed at once: memory above 32 MB would be cleared anew each time."""
 
 
 class FieldFile(Closing):
@@ -142,22 +144,20 @@ def fit_basis(
     most = min(rows, mean.size)
     wanted = min(_FIRST_MODES if count is None else count, most)
     if count is not None:
-        basis = _basis(blocks, mean, wanted, most, seed)
-        return with_step(_measured(blocks, basis), partial(_measured, blocks))
-    some = _spread_rows(blocks, rows)
-
-    def loss_on_some(modes: int) -> float:
-        own = _basis(lambda: [some], mean, modes, most, seed)
-        return _measured(lambda: [some], own).loss_mean
-
+        fitted = _fitted(blocks, mean, wanted, most, seed)
+        return with_step(fitted.measured(fitted.basis), fitted.measured)
+    which = np.unique(np.linspace(0, rows - 1, min(rows, _SOME_ROWS)).round().astype(int))
+    some = _rows_of(blocks, which)
     # Where the modes of some rows alone do not do for these rows, those of all rows do not either.
-    while wanted < most and not loss_on_some(wanted) < loss_mean:
+    own = _own(some, mean)
+    while wanted < min(most, len(some)) and not own.loss_of_first(wanted) < loss_mean:
         wanted = min(2 * wanted, most)
     while True:
-        basis = _basis(blocks, mean, wanted, most, seed)
-        fewest = _fewest(blocks, some, basis, loss_mean)
+        fitted = _fitted(blocks, mean, wanted, most, seed)
+        on_some = _CompressedFields(lambda: [some], fitted.basis, fitted.coefficients[which])
+        fewest = _fewest(fitted, on_some, loss_mean)
         if fewest.loss_mean < loss_mean:
-            return with_step(fewest, partial(_measured, blocks), below=loss_mean)
+            return with_step(fewest, fitted.measured, below=loss_mean)
         if wanted == most:
             raise DatasetError(
                 f"{wanted} modes lose {fewest.loss_mean:.3g} on average, allowed are"
@@ -165,13 +165,6 @@ def fit_basis(
                 remedy="allow more; float32 holds a field of 1 mm to about 1e-10 m",
             )
         wanted = min(2 * wanted, most)
-
-
-def _basis(blocks: Blocks, mean: Floats, wanted: int, most: int, seed: int) -> FieldBasis:
-    """The first modes of fields with a mean, shape (V, 3); their loss is not known yet."""
-    modes = _modes(blocks, mean.reshape(-1), min(wanted + _OVERSAMPLING, most), seed)[:wanted]
-    shaped = modes.reshape(len(modes), *mean.shape).astype(np.float32)
-    return FieldBasis(mean.astype(np.float32), shaped, 0.0, 0.0)
 
 
 def with_step(
@@ -205,13 +198,21 @@ class FieldEncoder:
         self._modes = basis.modes.reshape(len(basis.modes), -1).astype(np.float64)
 
     def __call__(self, fields: FloatArray) -> FloatArray:
-        """Coefficients, multiples of the basis's step, shape (R, K), of fields (R, V, 3)."""
-        flat = fields.reshape(len(fields), -1).astype(np.float64) - self._mean
-        return rounded(flat @ self._modes.T, self.basis.step)
+        """Coefficients as they are stored, shape (R, K), of fields (R, V, 3)."""
+        return self.stored(self.exact(fields))
 
-    def lost(self, fields: FloatArray) -> FieldLoss:
-        """What fields, shape (R, V, 3), lose when compressed."""
-        return lost(fields - self.basis.decode(self(fields)))
+    def exact(self, fields: FloatArray) -> Floats:
+        """Coefficients before they are rounded; linear in the fields, but for the mean."""
+        return (fields.reshape(len(fields), -1).astype(np.float64) - self._mean) @ self._modes.T
+
+    def stored(self, exact: Floats) -> FloatArray:
+        """Coefficients as they are stored: multiples of the basis's step."""
+        return rounded(exact, self.basis.step)
+
+    def lost(self, fields: FloatArray, exact: Floats | None = None) -> FieldLoss:
+        """What fields, shape (R, V, 3), lose when compressed; faster with their coefficients."""
+        stored = self(fields) if exact is None else self.stored(exact)
+        return lost(fields - self.basis.decode(stored))
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,45 +262,75 @@ def encode(basis: FieldBasis, fields: FloatArray) -> FloatArray:
 def loss(basis: FieldBasis, blocks: Blocks) -> tuple[float, float]:
     """Mean and largest distance of a node from its compressed form, over all rows."""
     encoder = FieldEncoder(basis)
-    return mean_and_largest(encoder.lost(block) for block in blocks())
+    return mean_and_largest(encoder.lost(rows) for block in blocks() for rows in _pieces(block))
 
 
-def _measured(blocks: Blocks, basis: FieldBasis) -> FieldBasis:
-    mean, largest = loss(basis, blocks)
-    return replace(basis, loss_mean=mean, loss_max=largest)
+class _CompressedFields:
+    """Fields with their coefficients: what fewer modes or a step lose takes half of the products.
+
+    Modes are orthonormal, so the coefficients of the first ones do not depend on the others.
+
+    Attributes:
+        basis: All modes; their loss is not known.
+        coefficients: Of all rows, not rounded, shape (R, K).
+    """
+
+    def __init__(self, blocks: Blocks, basis: FieldBasis, coefficients: Floats) -> None:
+        self.basis = basis
+        self.coefficients = coefficients
+        self._blocks = blocks
+
+    def measured(self, basis: FieldBasis) -> FieldBasis:
+        """The basis, some of the first modes and perhaps a step, with its loss on these fields."""
+        mean, largest = mean_and_largest(self._losses(basis))
+        return replace(basis, loss_mean=mean, loss_max=largest)
+
+    def loss_of_first(self, modes: int) -> float:
+        """Mean loss of so many modes."""
+        return self.measured(self.first(modes)).loss_mean
+
+    def first(self, modes: int) -> FieldBasis:
+        """The first modes alone."""
+        return replace(self.basis, modes=self.basis.modes[:modes])
+
+    def _losses(self, basis: FieldBasis) -> Iterator[FieldLoss]:
+        row, modes = 0, len(basis.modes)
+        for block in self._blocks():
+            for fields in _pieces(block):
+                those = self.coefficients[row : row + len(fields), :modes]
+                yield lost(fields - basis.decode(rounded(those, basis.step)))
+                row += len(fields)
 
 
-def _fewest(blocks: Blocks, some: FloatArray, basis: FieldBasis, loss_mean: float) -> FieldBasis:
+def _fewest(fitted: _CompressedFields, on_some: _CompressedFields, loss_mean: float) -> FieldBasis:
     """The shortest beginning of the modes that is good enough, or nearly; all if none is.
 
     A pass over all rows takes long, so how many are enough is asked of some, by bisection, and of
     all of them only in the end; where those want more, a thirtieth is added at a time.
-
     """
-
-    def first(modes: int, rows: Blocks) -> FieldBasis:
-        return _measured(rows, replace(basis, modes=basis.modes[:modes]))
-
-    too_few, enough = 0, len(basis.modes)
+    too_few, enough = 0, len(fitted.basis.modes)
     while enough - too_few > 1:
         middle = (too_few + enough) // 2
-        if first(middle, lambda: [some]).loss_mean < loss_mean:
+        if on_some.loss_of_first(middle) < loss_mean:
             enough = middle
         else:
             too_few = middle
     while True:
-        found = first(enough, blocks)
-        if found.loss_mean < loss_mean or enough == len(basis.modes):
+        found = fitted.measured(fitted.first(enough))
+        if found.loss_mean < loss_mean or enough == len(fitted.basis.modes):
             return found
-        enough = min(len(basis.modes), enough + max(1, enough // 30))
+        enough = min(len(fitted.basis.modes), enough + max(1, enough // 30))
 
 
-def _spread_rows(blocks: Blocks, rows: int) -> FloatArray:
-    """Some of the rows, evenly spaced: `_SOME_ROWS`, or all where they are not more."""
-    wanted = np.unique(np.linspace(0, rows - 1, min(rows, _SOME_ROWS)).round().astype(int))
+def _pieces(block: FloatArray) -> list[FloatArray]:
+    return [block[k : k + _AT_ONCE] for k in range(0, len(block), _AT_ONCE)]
+
+
+def _rows_of(blocks: Blocks, which: npt.NDArray[np.int64]) -> FloatArray:
+    """Rows by their number, ascending."""
     found, first = [], 0
     for block in blocks():
-        here = wanted[(wanted >= first) & (wanted < first + len(block))] - first
+        here = which[(which >= first) & (which < first + len(block))] - first
         found.append(block[here])
         first += len(block)
     return np.concatenate(found)
@@ -327,30 +358,57 @@ def _mean(blocks: Blocks) -> tuple[Floats, int]:
     return total / rows, rows
 
 
-def _modes(blocks: Blocks, mean: Floats, width: int, seed: int) -> Floats:
-    """The first modes of the centred fields, shape (width, 3 V), most important first."""
+def _fitted(blocks: Blocks, mean: Floats, wanted: int, most: int, seed: int) -> _CompressedFields:
+    """The first modes, most important first, of fields with a mean, shape (V, 3)."""
+    width = min(wanted + _OVERSAMPLING, most)
     draw = np.random.default_rng(seed).standard_normal((mean.size, width))
-    sketch = np.zeros_like(draw)
+    sketch, of_block = np.zeros_like(draw), np.empty_like(draw)
     for centred in _centred(blocks, mean):
-        sketch += centred.T @ (centred @ draw)
+        sketch += np.matmul(centred.T, centred @ draw, out=of_block)
     directions, _ = np.linalg.qr(sketch)
-    inner = np.zeros((width, width))
-    for centred in _centred(blocks, mean):
-        seen = centred @ directions
-        inner += seen.T @ seen
-    _, turn = np.linalg.eigh(inner)
-    return with_signs((directions @ turn[:, ::-1]).T)
+    seen = np.concatenate([centred @ directions for centred in _centred(blocks, mean)])
+    _, turn = np.linalg.eigh(seen.T @ seen)
+    return _turned(blocks, mean, directions, seen, turn[:, ::-1][:, :wanted])
+
+
+def _own(some: FloatArray, mean: Floats) -> _CompressedFields:
+    """All modes of few rows, about the mean of all."""
+    (centred,) = _centred(lambda: [some], mean)
+    directions, triangle = np.linalg.qr(centred.T)
+    turn, _, _ = np.linalg.svd(triangle)
+    return _turned(lambda: [some], mean, directions, triangle.T, turn)
+
+
+def _turned(
+    blocks: Blocks, mean: Floats, directions: Floats, seen: Floats, turn: Floats
+) -> _CompressedFields:
+    """Modes ``directions @ turn`` of fields, of which ``seen`` lies along the directions."""
+    modes = (directions @ turn).T
+    sign = _signs(modes)[:, None]
+    # In the order in which a file holds them, or products would differ in their last digit.
+    shaped = np.ascontiguousarray(sign * modes, np.float32).reshape(-1, *mean.shape)
+    basis = FieldBasis(mean.astype(np.float32), shaped, 0.0, 0.0)
+    return _CompressedFields(blocks, basis, seen @ turn * sign.T)
 
 
 def with_signs(modes: Floats) -> Floats:
     """Modes (K, 3 V), which are known up to their signs, with those on which two machines agree."""
+    return modes * _signs(modes)[:, None]
+
+
+def _signs(modes: Floats) -> Floats:
     peak = np.abs(modes).argmax(axis=1)
-    return np.asarray(modes * np.sign(modes[np.arange(len(modes)), peak])[:, None])
+    return np.asarray(np.sign(modes[np.arange(len(modes)), peak]))
 
 
 def _centred(blocks: Blocks, mean: Floats) -> Iterable[Floats]:
+    """Fields about their mean, shape (R, 3 V); each overwrites the one before."""
+    held = np.empty((0, mean.size))
     for block in blocks():
-        yield block.reshape(len(block), -1).astype(np.float64) - mean
+        if len(block) > len(held):
+            held = np.empty((len(block), mean.size))
+        flat = block.reshape(len(block), -1)
+        yield np.subtract(flat, mean.reshape(-1), out=held[: len(block)])
 
 
 Data = TypeVar("Data", ExperimentDataset, MixedDataset)

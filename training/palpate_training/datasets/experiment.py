@@ -160,7 +160,8 @@ class FieldBasis:
     def decode(self, coefficients: FloatArray) -> FloatArray:
         """Fields, shape (N, V, 3), of coefficients (N, K)."""
         flat = self.modes.reshape(len(self.modes), -1)
-        field = coefficients @ flat + self.mean.reshape(-1)
+        field = coefficients @ flat
+        field += self.mean.reshape(-1)
         return np.asarray(field.reshape(-1, *self.mean.shape), np.float32)
 
 

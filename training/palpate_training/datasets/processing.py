@@ -76,15 +76,30 @@ def filter_force(raw: RawTrial) -> RawTrial:
         DatasetError: The force is not finite, time runs backward, has a gap or is too slow for the
             cutoff, or ``increment_end`` makes no sense.
     """
-    signal = require("scipy.signal", extra="training")
-    name = trial_name(raw.header)
     _check_increments(raw)
-    if not np.isfinite(raw.force).all():
+    name = trial_name(raw.header)
+    return replace(raw, force=filter_dwells(name, raw.force, raw.time_s, raw.increment_end))
+
+
+def filter_dwells(name: str, force: Floats, time_s: Floats, increment_end: Rows) -> Floats:
+    """Forces as `filter_force` filters them.
+
+    Args:
+        name: Of the trial.
+        force: [N], shape (T, 3).
+        time_s: Of each sample [s], shape (T,).
+        increment_end: Last sample of each increment, shape (I,).
+
+    Raises:
+        DatasetError: See `filter_force`.
+    """
+    signal = require("scipy.signal", extra="training")
+    if not np.isfinite(force).all():
         raise DatasetError(
-            f"{name}: force is not finite in sample {_first_bad(raw.force)}",
+            f"{name}: force is not finite in sample {_first_bad(force)}",
             remedy="record the trial again",
         )
-    steps = np.diff(raw.time_s)
+    steps = np.diff(time_s)
     if len(steps) == 0 or steps.min() <= 0 or steps.max() > LONGEST_GAP_S:
         raise DatasetError(
             f"{name}: time_s must increase without a gap over {LONGEST_GAP_S} s;"
@@ -100,15 +115,15 @@ def filter_force(raw: RawTrial) -> RawTrial:
     sections = signal.butter(1, CUTOFF_HZ, fs=rate_hz, output="sos")
     padding = round(PADDING_S * rate_hz)
     # The first and what follows each end; those of one length at once, as there are many.
-    starts = np.array([0, *(raw.increment_end + 1)])
-    lengths = np.diff(starts, append=len(raw.force))
-    force = np.empty_like(raw.force)
+    starts = np.array([0, *(increment_end + 1)])
+    lengths = np.diff(starts, append=len(force))
+    filtered = np.empty_like(force)
     for length in set(lengths.tolist()) - {0}:
         rows = starts[lengths == length][:, None] + np.arange(length)
-        force[rows] = signal.sosfiltfilt(
-            sections, raw.force[rows], axis=1, padtype="even", padlen=min(padding, length - 1)
+        filtered[rows] = signal.sosfiltfilt(
+            sections, force[rows], axis=1, padtype="even", padlen=min(padding, length - 1)
         )
-    return replace(raw, force=force)
+    return filtered
 
 
 def last_of_increments(raw: RawTrial) -> RawTrial:

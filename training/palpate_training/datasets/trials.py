@@ -144,12 +144,15 @@ class MixedRows:
         displacement: Nodal displacement there [m], shape (R, V, 3), float32.
         contact_force: Force of the indenter on each outer node there [N], shape (R, O, 3), float32;
             None if it is not known.
+        shares: What each step of the simulation up to its divergence contributes to each row, shape
+            (R, S), rows of sum 1; None = not known.
     """
 
     rows: TrialRows
     simulated_force: Floats
     displacement: npt.NDArray[np.float32]
     contact_force: npt.NDArray[np.float32] | None = None
+    shares: Floats | None = None
 
 
 _log = logging.getLogger(__name__)

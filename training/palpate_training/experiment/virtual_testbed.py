@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from palpate.errors import ConfigError
 from palpate.rigid import Floats
-from palpate_training.datasets.trials import Counts, RawTrial, TrialHeader
+from palpate_training.datasets.processing import filter_dwells
+from palpate_training.datasets.trials import Counts, RawTrial, TrialHeader, trial_name
 from palpate_training.experiment.plan import (
     APPROACH_M,
     DWELL_S,
@@ -59,6 +60,7 @@ def perform(
     length_m: float | None = None,
     since_power_on_s: float = 1800.0,
     seed: int = 0,
+    last_only: bool = False,
 ) -> RawTrial:
     """Play a quasi-static press as a trial: approach, increments of 0.1 mm, 5 s each.
 
@@ -83,6 +85,9 @@ def perform(
         length_m: Commanded travel in all [m]; None = to the end of the result, in whole increments.
         since_power_on_s: Age of the force/torque sensor when the trial starts [s].
         seed: Same seed, same trial, where ``read_electrodes`` is deterministic.
+        last_only: Give what ``filter_force`` and ``last_of_increments`` would leave of the trial,
+            in a fraction of the time: electrodes are not read in dwells but for their last sample.
+            Their noise is drawn otherwise then.
 
     Raises:
         ConfigError: Rows that do not fit one another, touch at once or end too early, or electrodes
@@ -120,24 +125,33 @@ def perform(
     touched = np.maximum(weight, 0.0)  # before the first row nothing changes but the tip
     missed = random.normal(0.0, repeatability_m / math.sqrt(3.0), size=(len(commands) - 1, 3))
     time_s = nominal + late
-    electrodes = read_electrodes(_between(ideal, row, touched), time_s)
-    if electrodes.shape != (total, ideal.shape[1]) or electrodes.dtype != np.uint16:
+    ends = samples * np.arange(1, len(commands)) - 1
+    # Nothing that is ideal changes in a dwell, so what creeps or drifts needs no reading in it.
+    moved = np.diff(commanded, prepend=-1.0) != 0.0
+    at = np.union1d(np.flatnonzero(moved), ends) if last_only else np.arange(total)
+    electrodes = read_electrodes(_between(ideal, row[at], touched[at]), time_s[at])
+    if electrodes.shape != (len(at), ideal.shape[1]) or electrodes.dtype != np.uint16:
         raise ConfigError(
             f"read_electrodes gave {electrodes.dtype} {electrodes.shape}",
-            remedy=f"return uint16 ({total}, {ideal.shape[1]})",
+            remedy=f"return uint16 ({len(at)}, {ideal.shape[1]})",
         )
     sensor = WrenchSensor() if sensor is None else sensor
     read = sensor.read(
         _between(forces, row, touched), time_s, seed=random, since_power_on_s=since_power_on_s
     )
+    kept = np.arange(total)
+    if last_only:
+        read = filter_dwells(trial_name(header), read, time_s, ends)
+        electrodes, kept = electrodes[np.isin(at, ends)], ends
+    missed_at = np.repeat(missed, samples, axis=0)[kept]
     return RawTrial(
         header=header,
-        time_s=time_s,
+        time_s=time_s[kept],
         electrodes=electrodes,
-        force=read,
-        tip=_between(tips, row, weight) + error + np.repeat(missed, samples, axis=0),
-        travel_m=commanded,
-        increment_end=samples * np.arange(1, len(commands)) - 1,
+        force=read[kept],
+        tip=_between(tips, row[kept], weight[kept]) + error + missed_at,
+        travel_m=commanded[kept],
+        increment_end=np.arange(len(ends)) if last_only else ends,
     )
 
 

@@ -286,17 +286,18 @@ class TrajectoryEncoder:
             self._outer,
         )
         dropped: list[tuple[str, str]] = []
-        trials = tuple(
-            self._encode(one) for one in _mixed(task.rows, {task.name: simulated}, dropped)
-        )
         encode = self._encode
+        steps = encode.steps(simulated)
+        trials = tuple(
+            encode(one, steps) for one in _mixed(task.rows, {task.name: simulated}, dropped)
+        )
         assert encode.contact_force is not None
         assert simulated.contact_force is not None
         return EncodedTrajectory(
             trials,
             tuple(dropped),
-            encode.displacement.lost(simulated.displacement),
-            encode.contact_force.lost(simulated.contact_force),
+            encode.displacement.lost(simulated.displacement, steps.displacement),
+            encode.contact_force.lost(simulated.contact_force, steps.contact_force),
         )
 
 

@@ -321,8 +321,8 @@ def _make(experiment: SharedExperiment[Any], link: Connection) -> None:
     # While some are pressed others need the cores, about as many as there are devices. More threads
     # than cores wait for each other: three fits of bases on two cores took 162 s, not 57 s.
     at_once = len(experiment.devices)
-    limit_threads(max(1, (os.cpu_count() or 1) // at_once))
-    workers = max(1, min(experiment.workers, _AHEAD * experiment.workers // at_once))
+    limit_threads(max(1, (os.cpu_count() or 1) // (_AHEAD * at_once)))
+    workers = max(1, experiment.workers // at_once)
     stop, orders = threading.Event(), SimpleQueue[tuple[FingertipShare, str] | None]()
 
     def listen() -> None:

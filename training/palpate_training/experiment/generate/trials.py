@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
-from palpate_training.datasets.processing import process
+from palpate_training.datasets.processing import from_half_newton, tare
 from palpate_training.datasets.trials import TrialHeader, TrialRows
 from palpate_training.experiment.clearance import pad_poses, simulate_registrations
 from palpate_training.experiment.generate.simulator import (
@@ -301,7 +301,7 @@ def _perform(
         drift = specimen.temperature_coefficient * TEMPERATURE_WALK_K * walk
         return stream(ideal, time_s, elapsed, drift)
 
-    raw = perform(
+    last = perform(
         TrialHeader(specimen.name, task.name, trajectory.indenter, task.arm),
         travel_m=np.concatenate([[0.0], travel]),
         force=force,
@@ -313,8 +313,9 @@ def _perform(
         length_m=np.floor(length_m / 1e-4 + 1e-6) * 1e-4,
         since_power_on_s=WARM_S,
         seed=seed,
+        last_only=True,
     )
-    return process(raw)
+    return from_half_newton(tare(last))
 
 
 def pack(done: TrialsDone) -> bytes:
