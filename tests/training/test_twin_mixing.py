@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.assembly import common_trajectories, interpolate, mix
+from palpate_training.datasets.assembly import TrialEncoder, common_trajectories, interpolate, mix
+from palpate_training.datasets.basis import fit_basis
+from palpate_training.datasets.experiment import SkinMesh
 from palpate_training.datasets.trials import SimulatedTrial, TrialHeader, TrialRows
 
 HEADER = TrialHeader("biotac-1", "sphere/03/normal", "sphere", "left")
@@ -52,6 +54,29 @@ def test_both_start_at_half_a_newton_and_end_at_the_smaller_displacement(
     np.testing.assert_allclose(found.displacement, expected, rtol=1e-5)
     assert found.displacement.dtype == np.float32
     np.testing.assert_array_equal(found.rows.rest, rows.rest)
+
+
+def test_rows_lie_between_steps_and_so_do_their_coefficients(
+    rows: TrialRows, simulated: SimulatedTrial
+) -> None:
+    found, before = mix(rows, simulated), slice(0, simulated.converged)
+    assert found.shares is not None
+    np.testing.assert_allclose(found.shares.sum(axis=1), 1.0)
+    np.testing.assert_allclose(
+        np.einsum("rs,svc->rvc", found.shares, simulated.displacement[before]),
+        found.displacement,
+        atol=1e-9,
+    )
+    some = np.random.default_rng(0).normal(size=(9, 4, 3)).astype(np.float32)
+    faces = np.array([[0, 1, 2]], np.int32)
+    mesh = SkinMesh(np.zeros((4, 3)), faces, faces, np.arange(4, dtype=np.int32), "ab")
+    encode = TrialEncoder(mesh, replace(fit_basis(lambda: [some], count=5), step=2.0**-24))
+    direct, by_steps = encode(found), encode(found, encode.steps(simulated))
+    assert np.abs(direct.coefficients).max() > 1e-3
+    np.testing.assert_allclose(by_steps.coefficients, direct.coefficients, atol=2.0**-24)
+    other = replace(simulated, displacement=simulated.displacement[:, :3])
+    with pytest.raises(DatasetError, match="displacement has shape"):
+        encode.steps(other)
 
 
 def test_the_experiment_may_be_the_shorter_one(rows: TrialRows, simulated: SimulatedTrial) -> None:
