@@ -1,4 +1,4 @@
-"""For every process of palpate: ``with`` blocks, optional packages, folders, use of the host."""
+"""For every process of palpate: ends, optional packages, folders, use of the host, progress."""
 
 from __future__ import annotations
 
@@ -18,15 +18,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType, ModuleType, TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from palpate.errors import MissingExtraError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 _LOOK_S = 0.5
 """Least time between two looks [s]: a share of the processor over less is noise."""
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _TICKS_HZ = os.sysconf("SC_CLK_TCK")
+
+LINE_EVERY_S = 30.0
+"""Least time between two lines on progress in a log [s]."""
 
 
 class ProcessUsage:
@@ -157,6 +163,41 @@ def stop_on_signals(*signals: signal.Signals) -> threading.Event:
     for number in signals or (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
     return stop
+
+
+@contextmanager
+def told_in_log(progress: Progress, every_s: float = LINE_EVERY_S) -> Iterator[None]:
+    """Write the tasks of a progress bar that got on to stderr where no terminal shows the bar.
+
+    A line every ``every_s`` [s], none where nothing got on, so that a job whose output is a file is
+    seen to work, or to hang.
+    """
+    if progress.console.is_terminal:
+        yield
+        return
+    began_s, ended = time.monotonic(), threading.Event()
+    told: dict[int, float] = {}
+
+    def tell() -> None:
+        while not ended.wait(every_s):
+            moved = [one for one in progress.tasks if told.get(one.id, 0.0) != one.completed]
+            told.update((one.id, one.completed) for one in moved)
+            if moved:
+                words = ", ".join(
+                    f"{one.description} {one.completed:g}"
+                    + ("" if one.total is None else f" of {one.total:g}")
+                    for one in moved
+                )
+                sys.stderr.write(f"after {time.monotonic() - began_s:.0f} s: {words}\n")
+                sys.stderr.flush()
+
+    teller = threading.Thread(target=tell, name="progress", daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        teller.join()
 
 
 def require(module: str, *, extra: str) -> ModuleType:

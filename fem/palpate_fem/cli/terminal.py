@@ -24,7 +24,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from palpate.process import setter_for_signals
+from palpate.process import setter_for_signals, told_in_log
 
 console = Console(stderr=True)
 """For progress and remarks."""
@@ -37,17 +37,13 @@ class _Info(ProgressColumn):
         return Text(str(task.fields.get("info", "")))
 
 
-def progress_bar() -> Progress:
-    """A progress bar on stderr; tasks may carry ``info``, a text after the bar."""
-    return Progress(
-        TextColumn("{task.description:10}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        _Info(),
-        console=console,
-        transient=True,
-    )
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """A progress bar on stderr, lines in a log; tasks may carry ``info``, a text after the bar."""
+    columns = (TextColumn("{task.description:10}"), BarColumn(), MofNCompleteColumn())
+    bar = Progress(*columns, TimeElapsedColumn(), _Info(), console=console, transient=True)
+    with bar, told_in_log(bar):
+        yield bar
 
 
 def print_lines(*lines: str, to: Console | None = None) -> None:

@@ -23,7 +23,7 @@ from rich.table import Table
 
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.atomic import written_whole
-from palpate.process import typed_command
+from palpate.process import told_in_log, typed_command
 
 if TYPE_CHECKING:
     from palpate_training.evaluation.cells import Cell
@@ -199,7 +199,7 @@ def _table(found: BundleErrors) -> Table:
 
 def make_with_progress(study: Study, folder: Path, workers: int, device: str) -> None:
     """Make what the folder does not hold, under a bar with the time left."""
-    with Progress(
+    progress = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -207,7 +207,8 @@ def make_with_progress(study: Study, folder: Path, workers: int, device: str) ->
         TextColumn("left"),
         TimeRemainingColumn(elapsed_when_finished=False),
         console=console,
-    ) as progress:
+    )
+    with progress, told_in_log(progress):
         bar = progress.add_task("trainings", total=len(study.cells))
 
         def on_cell(cell: Cell, made: bool) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +17,7 @@ from rich.table import Table
 from palpate.files.atomic import written_whole
 from palpate.files.bundle import read_bundle
 from palpate.files.card import model_card
-from palpate.process import typed_command
+from palpate.process import told_in_log, typed_command
 from palpate_training.datasets.features import open_dataset
 
 Mixed = Annotated[Path, typer.Argument(help="Mixed data set (.h5).")]
@@ -532,14 +533,12 @@ def _bundle(
         )
 
 
-def _progress(to: Console = console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=to,
-    )
+@contextmanager
+def _progress(to: Console = console) -> Iterator[Progress]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    progress = Progress(*columns, TimeElapsedColumn(), console=to)
+    with progress, told_in_log(progress):
+        yield progress
 
 
 def _finish(progress: Progress) -> None:
