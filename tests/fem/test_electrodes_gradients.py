@@ -112,7 +112,8 @@ def test_gradients_by_gaps_and_pressures(sensor: ElectrodeModel, regime: str) ->
     assert by_gap == pytest.approx(differences, rel=WITHIN)
     way = gap.pressure * wave
     by_pressure = weight @ response.gradient_pressure() @ way
-    differences = fourth_order(lambda s: value(replace(gap, pressure=gap.pressure + s * way)), 1e-3)
+    # On the floor counts change so little that smaller steps drown in rounding on some processors.
+    differences = fourth_order(lambda s: value(replace(gap, pressure=gap.pressure + s * way)), 1e-2)
     assert by_pressure == pytest.approx(differences, rel=WITHIN)
 
 
