@@ -15,12 +15,13 @@ from palpate_training.datasets import basis as basis_module
 from palpate_training.datasets.basis import (
     LOSS_MEAN_M,
     Blocks,
+    FieldEncoder,
     FieldFile,
     encode,
     fit_basis,
-    loss,
+    mean_and_largest,
 )
-from palpate_training.datasets.experiment import FloatArray
+from palpate_training.datasets.experiment import FieldBasis, FloatArray
 
 NODES = 30
 
@@ -39,6 +40,12 @@ def in_blocks(data: FloatArray, size: int) -> Blocks:
         return (data[i : i + size] for i in range(0, len(data), size))
 
     return blocks
+
+
+def loss(basis: FieldBasis, blocks: Blocks) -> tuple[float, float]:
+    """Mean and largest loss of fields that are compressed anew."""
+    encoder = FieldEncoder(basis)
+    return mean_and_largest(encoder.lost(block) for block in blocks())
 
 
 def test_as_many_modes_as_the_loss_asks_for_and_no_more() -> None:

@@ -211,16 +211,21 @@ class EncodedTrial:
 
 
 @dataclass(frozen=True, slots=True)
-class StepCoefficients:
-    """Coefficients of a simulation's steps, not rounded.
+class ExactCoefficients:
+    """Coefficients of both fields of some rows or steps, not rounded.
 
     Attributes:
-        displacement: Shape (S, K).
-        contact_force: Shape (S, F); None where these are left out.
+        displacement: Shape (R, K).
+        contact_force: Shape (R, F); None where these are left out.
     """
 
     displacement: Floats
     contact_force: Floats | None
+
+    def between(self, shares: Floats) -> ExactCoefficients:
+        """Those of rows to which these contribute shares, shape (Q, R)."""
+        contact = None if self.contact_force is None else shares @ self.contact_force
+        return ExactCoefficients(shares @ self.displacement, contact)
 
 
 class TrialEncoder:
@@ -238,7 +243,7 @@ class TrialEncoder:
         self.displacement = FieldEncoder(basis)
         self.contact_force = None if contact_basis is None else FieldEncoder(contact_basis)
 
-    def steps(self, simulated: SimulatedTrial) -> StepCoefficients:
+    def steps(self, simulated: SimulatedTrial) -> ExactCoefficients:
         """Coefficients of a simulation's steps, of which those of its trials' rows are made.
 
         Raises:
@@ -250,12 +255,13 @@ class TrialEncoder:
                 f"{simulated.trajectory}: displacement has shape {found}, expected {expected}",
                 remedy="simulate with the mesh that the data set names",
             )
-        before, contact = slice(0, simulated.converged), None
-        if self.contact_force is not None and simulated.contact_force is not None:
-            contact = self.contact_force.exact(simulated.contact_force[before])
-        return StepCoefficients(self.displacement.exact(simulated.displacement[before]), contact)
+        contact = simulated.contact_force
+        return self._exact(
+            simulated.displacement[: simulated.converged],
+            None if contact is None else contact[: simulated.converged],
+        )
 
-    def __call__(self, mixed: MixedRows, steps: StepCoefficients | None = None) -> EncodedTrial:
+    def __call__(self, mixed: MixedRows, steps: ExactCoefficients | None = None) -> EncodedTrial:
         """Check and encode a trial.
 
         Args:
@@ -268,25 +274,30 @@ class TrialEncoder:
         """
         _check_fields(mixed, self._mesh, contact=self.contact_force is not None)
         if steps is None or mixed.shares is None:
-            moved = self.displacement.exact(mixed.displacement)
+            exact = self._exact(mixed.displacement, mixed.contact_force)
         else:
-            moved = mixed.shares @ steps.displacement
+            exact = steps.between(mixed.shares)
         contact = None
-        if self.contact_force is not None and mixed.contact_force is not None:
-            if steps is None or mixed.shares is None or steps.contact_force is None:
-                pressed = self.contact_force.exact(mixed.contact_force)
-            else:
-                pressed = mixed.shares @ steps.contact_force
+        if self.contact_force is not None and exact.contact_force is not None:
+            assert mixed.contact_force is not None
             contact = (
                 *contact_of(self._mesh, mixed.displacement, mixed.contact_force),
-                self.contact_force.stored(pressed),
+                self.contact_force.stored(exact.contact_force),
             )
         return EncodedTrial(
             mixed.rows,
             mixed.simulated_force.astype(np.float32),
-            self.displacement.stored(moved),
+            self.displacement.stored(exact.displacement),
             contact,
         )
+
+    def _exact(
+        self, displacement: FloatArray, contact_force: FloatArray | None
+    ) -> ExactCoefficients:
+        contact = None
+        if self.contact_force is not None and contact_force is not None:
+            contact = self.contact_force.exact(contact_force)
+        return ExactCoefficients(self.displacement.exact(displacement), contact)
 
 
 def assemble_encoded(

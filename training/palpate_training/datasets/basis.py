@@ -259,12 +259,6 @@ def encode(basis: FieldBasis, fields: FloatArray) -> FloatArray:
     return FieldEncoder(basis)(fields)
 
 
-def loss(basis: FieldBasis, blocks: Blocks) -> tuple[float, float]:
-    """Mean and largest distance of a node from its compressed form, over all rows."""
-    encoder = FieldEncoder(basis)
-    return mean_and_largest(encoder.lost(rows) for block in blocks() for rows in _pieces(block))
-
-
 class _CompressedFields:
     """Fields with their coefficients: what fewer modes or a step lose takes half of the products.
 

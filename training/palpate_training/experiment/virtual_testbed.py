@@ -126,9 +126,9 @@ def perform(
     missed = random.normal(0.0, repeatability_m / math.sqrt(3.0), size=(len(commands) - 1, 3))
     time_s = nominal + late
     ends = samples * np.arange(1, len(commands)) - 1
-    # Nothing that is ideal changes in a dwell, so what creeps or drifts needs no reading in it.
-    moved = np.diff(commanded, prepend=-1.0) != 0.0
-    at = np.union1d(np.flatnonzero(moved), ends) if last_only else np.arange(total)
+    at = np.arange(total)
+    if last_only:  # nothing ideal changes in a dwell: what creeps or drifts needs no reading in it
+        at = np.union1d(np.flatnonzero(np.diff(commanded, prepend=-1.0)), ends)
     electrodes = read_electrodes(_between(ideal, row[at], touched[at]), time_s[at])
     if electrodes.shape != (len(at), ideal.shape[1]) or electrodes.dtype != np.uint16:
         raise ConfigError(
