@@ -83,7 +83,10 @@ def test_nodes_stand_off_a_ball_and_farther_on_coarser_faces(shell: Mesh) -> Non
         # The skin lies on a ball of its own radius from outside, as in a mould.
         found = MortarWeights(mesh.nodes, mesh.inner_faces).correction(
             mesh.nodes,
-            lambda x: (np.linalg.norm(x, axis=1) - 2.5e-3, x / np.linalg.norm(x, axis=1)[:, None]),
+            lambda x, _: (
+                np.linalg.norm(x, axis=1) - 2.5e-3,
+                x / np.linalg.norm(x, axis=1)[:, None],
+            ),
             FAR_M,
         )
         assert (found.gap < 0.0).all()

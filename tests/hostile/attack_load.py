@@ -21,6 +21,7 @@ from tests.hostile.lab import LIVE_S, STATION, Heard, Lab, copy_of_bundle, raw, 
 
 from palpate.admin import signed
 from palpate.bus import endpoints
+from palpate.bus.query import LOOK_S, is_served
 from palpate.bus.topics import sensor_key, service_key
 from palpate.codec import ERROR
 from palpate.config import Role
@@ -222,8 +223,10 @@ def flood_of_questions(lab: Lab) -> Outcome:
     before = lab.counter("features", "estimates_published")
     asked = 3000
     answers: list[zenoh.Reply] = []
-    began_s = time.monotonic()
     with lab.robot() as robot:
+        # What a session asks before it has heard of the service ends without an answer.
+        lab.wait(lambda: is_served(raw(robot), key, LOOK_S), "the robot hears of the service")
+        began_s = time.monotonic()
         for _ in range(asked):
             raw(robot).get(
                 key,
