@@ -21,7 +21,6 @@ wp.set_module_options({"enable_backward": False})
 TOUCH_M = 1e-9
 """A smaller gap counts as contact [m]."""
 
-_ALL = 1e300  # a margin that no gap reaches
 _TOUCH = wp.constant(wp.float64(TOUCH_M))
 _MOVES = wp.constant(2000)  # contact at a glancing angle is approached slowly
 
@@ -88,7 +87,7 @@ def first_touch(
 
 
 def _evaluate(
-    indenter: Indenter, points: Floats, sloped: int, margin_m: float = _ALL
+    indenter: Indenter, points: Floats, sloped: int, margin_m: float = np.inf
 ) -> tuple[Floats, Floats, Floats]:
     points = np.ascontiguousarray(points, np.float64)
     gap, normal, hessian = np.empty(len(points)), np.empty((sloped, 3)), np.empty((sloped, 3, 3))
@@ -101,7 +100,7 @@ def _evaluate(
     return gap, normal, hessian
 
 
-def signed_distance(indenter: Indenter, points: Floats, margin_m: float = _ALL) -> Floats:
+def signed_distance(indenter: Indenter, points: Floats, margin_m: float = np.inf) -> Floats:
     """Gap alone [m], shape (N,), positive outside; see `distance`.
 
     Where it is above the margin, it may be any smaller value that is above the margin, too.
@@ -109,15 +108,18 @@ def signed_distance(indenter: Indenter, points: Floats, margin_m: float = _ALL) 
     return _evaluate(indenter, points, 0, margin_m)[0]
 
 
-def distance(indenter: Indenter, points: Floats) -> tuple[Floats, Floats, Floats]:
+def distance(
+    indenter: Indenter, points: Floats, margin_m: float = np.inf
+) -> tuple[Floats, Floats, Floats]:
     """Gap, normal and hessian.
 
     Args:
         indenter: The indenter.
         points: Positions [m], shape (N, 3), indenter frame.
+        margin_m: Gap above which any value above it will do, with derivatives of zero [m].
 
     Returns:
         Gap [m], shape (N,), positive outside; its gradient, a unit vector away from the indenter,
         shape (N, 3); and its second derivative [1/m], shape (N, 3, 3). All in the indenter frame.
     """
-    return _evaluate(indenter, points, len(points))
+    return _evaluate(indenter, points, len(points), margin_m)

@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from palpate.rigid import rotation_matrices
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.device import DEVICE, indices, launch, mat33s, scalars, vec3s
-from palpate_fem.indenter.distance import distance
+from palpate_fem.indenter.distance import distance, signed_distance
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mechanics import contact_kernels
 from palpate_fem.mechanics.contact_kernels import ContactLaw
@@ -96,10 +97,17 @@ class PosedIndenter:
         """Points of the sensor frame in the indenter frame."""
         return np.asarray((points - self.tip) @ self.rotation)
 
-    def distance(self, points: Floats) -> tuple[Floats, Floats]:
-        """Gaps [m], (N,), and their gradients, (N, 3), at points (N, 3) of the sensor frame [m]."""
-        gap, normal, _ = distance(self.shape, self.to_local(points))
+    def distance(self, points: Floats, margin_m: float = np.inf) -> tuple[Floats, Floats]:
+        """Gaps [m], (N,), and their gradients, (N, 3), at points (N, 3) of the sensor frame [m].
+
+        Above the margin [m] a gap may be any value above it, and has no gradient.
+        """
+        gap, normal, _ = distance(self.shape, self.to_local(points), margin_m)
         return gap, normal @ self.rotation.T
+
+    def bound(self, points: Floats, margin_m: float) -> Floats:
+        """Gaps [m], (N,), at points (N, 3) of the sensor frame [m]; see `signed_distance`."""
+        return signed_distance(self.shape, self.to_local(points), margin_m)
 
     def curved(self, points: Floats) -> tuple[Floats, Floats]:
         """Gradients (N, 3) and second derivatives (N, 3, 3) [1/m] of the gaps at points (N, 3)."""
@@ -257,6 +265,25 @@ class ContactSurface:
         self.keep(self.no_correction, np.zeros(self.area_values.shape))
         self.gap[:] = np.inf
 
+    def near(self, bound: Floats, margin_m: float) -> wp.array:
+        """Faces of which a node may touch, or touched at the last evaluation.
+
+        Args:
+            bound: Gaps of the surface's nodes [m], or less, but above the margin, where they are
+                above it. Those of all other faces are set.
+            margin_m: Gap from which on a node cannot touch [m].
+        """
+        gap = np.empty(self.nodes)
+        gap[self.mortar.nodes] = bound
+        self.gap[:] = gap[self._corners]
+        touched = self.status.numpy() > 0
+        return _numbers(((self.gap < margin_m) | touched).T.any(axis=0))
+
+    def pressed(self, pressure: Floats) -> wp.array:
+        """Faces with pressure; no other is `loaded` until the next evaluation."""
+        self.mortar_status.zero_()
+        return _numbers((pressure.T != 0.0).any(axis=0))
+
     def pressure_misfit(self, pressure: Floats) -> float:
         """Largest difference between pressures and what the normal law demands [Pa]."""
         return float(np.abs(self._wanted - pressure).max()) if self.count else 0.0
@@ -344,19 +371,23 @@ class IndenterContact:
             surface.clear()
             return
         primitives, kind, tip, rotation = indenter.model
+        margin_m = self.settings.margin_m
+        near = surface.near(
+            indenter.bound(state.position[surface.mortar.nodes], margin_m), margin_m
+        )
         launch(
             contact_kernels.indenter_contact,
-            (surface.count, surface.points),
+            (len(near), surface.points),
             [
                 *surface.model,
                 primitives,
                 kind,
                 self.settings.law(indenter.friction),
-                wp.float64(self.settings.margin_m),
+                wp.float64(margin_m),
                 tip,
                 rotation,
                 surface.nodes,
-                surface.items,
+                near,
                 position,
                 scalars(state.on_indenter.gap),
                 scalars(state.indenter_pressure),
@@ -371,9 +402,10 @@ class IndenterContact:
         )
         surface.keep(state.on_indenter, state.indenter_pressure)
         if self.settings.mortar:
+            pressed = surface.pressed(state.indenter_pressure)
             launch(
                 contact_kernels.mortar_on_indenter,
-                (surface.count, surface.points),
+                (len(pressed), surface.points),
                 [
                     *surface.quadrature,
                     primitives,
@@ -381,7 +413,7 @@ class IndenterContact:
                     tip,
                     rotation,
                     surface.nodes,
-                    surface.items,
+                    pressed,
                     position,
                     scalars(state.indenter_pressure),
                     vec3s(state.on_indenter.held),
@@ -442,16 +474,17 @@ class CoreContact:
         )
         surface.keep(state.on_core, state.core_pressure)
         if self.settings.mortar:
+            pressed = surface.pressed(state.core_pressure)
             launch(
                 contact_kernels.mortar_on_core,
-                (surface.count, surface.points),
+                (len(pressed), surface.points),
                 [
                     *surface.quadrature,
                     self._table,
                     wp.vec3d(*core.origin),
                     wp.float64(core.spacing),
                     surface.nodes,
-                    surface.items,
+                    pressed,
                     position,
                     scalars(state.core_pressure),
                 ],
@@ -465,11 +498,11 @@ class CoreContact:
             return surface.no_correction
         return surface.mortar.correction(state.position, self._distance, self.settings.margin_m)
 
-    def _distance(self, points: Floats) -> tuple[Floats, Floats]:
+    def _distance(self, points: Floats, margin_m: float) -> tuple[Floats, Floats]:
         """Distance to the core [m], (N,), and its gradient, (N, 3); see `DistanceGrid.evaluate`.
 
-        Far from the core, too: the means of gaps need it wherever a touching face's points are, as
-        the forces at these points do.
+        Above the margin [m] it may be any value above it. The means of gaps need it wherever a
+        touching face's points are, as the forces at these points do, so far away, too.
         """
         assert self.core is not None
         gap, normal = np.empty(len(points)), np.empty((len(points), 3))
@@ -480,8 +513,14 @@ class CoreContact:
                 self._table,
                 wp.vec3d(*self.core.origin),
                 wp.float64(self.core.spacing),
+                wp.float64(margin_m),
                 vec3s(np.ascontiguousarray(points)),
             ],
             [scalars(gap), vec3s(normal)],
         )
         return gap, normal
+
+
+def _numbers(chosen: NDArray[np.bool_]) -> wp.array:
+    """Numbers of the faces that are chosen, (F,), as kernels take them."""
+    return indices(np.flatnonzero(chosen).astype(np.int32))

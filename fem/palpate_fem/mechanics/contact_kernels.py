@@ -457,15 +457,24 @@ def core_distances(
     coefficients: wp.array3d(dtype=wp.float64),
     origin: wp.vec3d,
     spacing: wp.float64,
+    margin: wp.float64,
     point_in: wp.array(dtype=wp.vec3d),
     gap_out: wp.array(dtype=wp.float64),
     normal_out: wp.array(dtype=wp.vec3d),
 ):
-    """`core_distance` at each point, but its second derivative."""
+    """`core_distance` at each point, but its second derivative.
+
+    Where the coefficient of a point's cell shows that the gap is above the margin (`CELL`), it is
+    taken for the gap.
+    """
     i = wp.tid()
-    near = core_distance(coefficients, origin, spacing, point_in[i])
-    gap_out[i] = near.gap
-    normal_out[i] = near.normal
+    cell = grid_cell(coefficients, origin, spacing, point_in[i])
+    gap_out[i] = coefficients[cell[0], cell[1], cell[2]]
+    normal_out[i] = wp.vec3d()
+    if gap_out[i] < margin + CELL * spacing:
+        near = core_distance(coefficients, origin, spacing, point_in[i])
+        gap_out[i] = near.gap
+        normal_out[i] = near.normal
 
 
 @wp.kernel

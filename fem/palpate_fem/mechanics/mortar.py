@@ -41,14 +41,18 @@ side to the other where the point moves by a micrometre, and with it the forces:
 would cycle. Where there is no valley, holding would only make corrections converge slowly.
 """
 
-Distance = Callable[[Floats], tuple[Floats, Floats]]
-"""Gaps [m], (N,), and their gradients, (N, 3), at points [m], (N, 3)."""
+Distance = Callable[[Floats, float], tuple[Floats, Floats]]
+"""Gaps [m], (N,), and their gradients, (N, 3), at points [m], (N, 3).
+
+Above a margin [m], the second argument, the gap may be any value above it, and the gradient too.
+"""
 
 
 class MortarWeights:
     """Dual mortar weights of one surface, on its undeformed faces.
 
     Attributes:
+        nodes: Node ids of the surface, (N,).
         shape: Shape functions of a face at its quadrature points, (Q, k).
         weight: Dual shape function of each corner times the area of each quadrature point [m^2],
             (F, Q, k).
@@ -70,7 +74,7 @@ class MortarWeights:
         mass = np.einsum("fq,qa,qb->fab", size, element.shape, element.shape)
         dual = self.corner_area[:, :, None] * np.linalg.inv(mass)
         self.weight = np.einsum("fq,fab,qb->fqa", size, dual, element.shape)
-        self._nodes = np.unique(faces)
+        self.nodes = np.unique(faces)
         self.area = np.zeros(len(nodes))
         np.add.at(self.area, faces, self.corner_area)
 
@@ -88,34 +92,39 @@ class MortarWeights:
         faces = self._faces
         offset = np.zeros(len(position))
         gap, normal = np.full(len(position), np.inf), np.zeros(position.shape)
-        gap[self._nodes], normal[self._nodes] = distance(position[self._nodes])
+        gap[self.nodes], normal[self.nodes] = distance(position[self.nodes], near_m)
         touchable = gap < near_m
-        near = np.flatnonzero(touchable[faces].any(axis=1))
-        faces, weight = faces[near], self.weight[near]
-        points = np.einsum("qa,fai->fqi", self.shape, position[faces])
-        inside, outward = distance(points.reshape(-1, 3))
-        mean = np.zeros(len(position))
-        np.add.at(mean, faces, np.einsum("fqa,fq->fa", weight, inside.reshape(points.shape[:2])))
+        near = np.flatnonzero(touchable[faces.T].any(axis=0))
+        # One product for all faces is faster than one for each, so points come first: (Q, F', ...).
+        faces, weight = faces[near], self.weight[near].transpose(1, 0, 2)
+        corners, (points, _) = faces.shape[1], self.shape.shape
+        at = (self.shape @ position[faces.T].reshape(corners, -1)).reshape(-1, 3)
+        inside, outward = distance(at, np.inf)
+        shares = (weight * inside.reshape(points, -1, 1)).sum(axis=0)
+        mean = np.bincount(faces.ravel(), shares.ravel(), minlength=len(position))
         offset[touchable] = mean[touchable] / self.area[touchable] - gap[touchable]
         # Force on corner b for a pressure at corner a: at the points, less that at the corner.
-        spread = np.einsum("fqa,qb,fqi->fabi", weight, self.shape, outward.reshape(points.shape))
-        corner = np.arange(faces.shape[1])
-        spread[:, corner, corner] -= self.corner_area[near][..., None] * normal[faces]
-        held = np.zeros((len(self._faces), *points.shape[1:]))
+        loads = weight[..., None] * outward.reshape(points, -1, 1, 3)
+        spread = (self.shape.T @ loads.reshape(points, -1)).reshape(corners, *loads.shape[1:])
+        corner = np.arange(corners)
+        spread[corner, :, corner] -= (self.corner_area[near][..., None] * normal[faces]).swapaxes(
+            0, 1
+        )
+        held = np.zeros((len(self._faces), points, 3))
         outward[inside < hanging_m] = 0.0
-        held[near] = outward.reshape(points.shape)
+        held[near] = outward.reshape(points, -1, 3).swapaxes(0, 1)
         return MortarCorrection(
             offset[self._faces], self._matrix(spread, near, len(position)), held
         )
 
-    def _matrix(self, spread: Floats, near: NDArray[np.intp], nodes: int) -> sparse.csr_array:
-        """`MortarCorrection.spread` of blocks (F', k, k, 3) of the faces ``near``, (F',)."""
+    def _matrix(self, spread: Floats, near: NDArray[np.intp], nodes: int) -> sparse.csc_array:
+        """`MortarCorrection.spread` of blocks (corner b, F', corner a, 3) of the faces ``near``."""
         corners = self._faces.shape[1]
-        row = 3 * self._faces[near][:, None, :, None] + np.arange(3)
-        column = corners * near[:, None] + np.arange(corners)
-        places = (
-            np.broadcast_to(row, spread.shape).ravel(),
-            np.broadcast_to(column[:, :, None, None], spread.shape).ravel(),
-        )
+        entries = np.zeros(self._faces.shape, np.int32)  # of each column
+        entries[near] = 3 * corners
+        begins = np.concatenate(([0], entries.ravel().cumsum(dtype=np.int32)))
+        rows = 3 * self._faces[near].astype(np.int32)[..., None] + np.arange(3, dtype=np.int32)
+        rows = np.broadcast_to(rows[:, None], (len(near), corners, corners, 3))
         shape = (3 * nodes, self._faces.size)
-        return sparse.coo_array((spread.ravel(), places), shape=shape).tocsr()
+        values = spread.transpose(1, 2, 0, 3)
+        return sparse.csc_array((values.ravel(), rows.ravel(), begins), shape=shape)

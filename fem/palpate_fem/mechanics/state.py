@@ -31,14 +31,14 @@ class MortarCorrection:
     """
 
     gap: Floats
-    spread: sparse.csr_array
+    spread: sparse.csc_array
     held: Floats
 
     @classmethod
     def none(cls, faces: Ints, nodes: int) -> MortarCorrection:
         """Contact at the nodes."""
         size = (len(faces), _points(faces))
-        spread = sparse.csr_array((3 * nodes, faces.size))
+        spread = sparse.csc_array((3 * nodes, faces.size))
         return cls(np.zeros(size), spread, np.zeros((*size, 3)))
 
     def load(self, pressure: Floats) -> Floats:

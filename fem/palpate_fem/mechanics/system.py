@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import warp as wp
@@ -27,9 +28,17 @@ from palpate_fem.mechanics.contact import (
 )
 from palpate_fem.mechanics.element_kernels import VOLUME_BARRIER
 from palpate_fem.mechanics.skin import FluidCavity, SkinElements
-from palpate_fem.mechanics.state import TRACTION_FLOOR_PA, ForceBalance, SolutionState
+from palpate_fem.mechanics.state import (
+    TRACTION_FLOOR_PA,
+    ForceBalance,
+    MortarCorrection,
+    SolutionState,
+)
 from palpate_fem.mesh.core import DistanceGrid
 from palpate_fem.mesh.solid import SolidMesh
+
+A = TypeVar("A")
+B = TypeVar("B")
 
 OffsetChanges = tuple[Floats, Floats]
 """How the offsets of the gaps of the nodes change [m], to the indenter and to the core, (V,)."""
@@ -226,8 +235,7 @@ class EquilibriumSystem:
 
     def correct_contact(self, state: SolutionState, indenter: PosedIndenter | None) -> None:
         """Evaluate the mortar corrections of a state and keep them in it."""
-        state.on_indenter = self.on_indenter.correction(state, indenter)
-        state.on_core = self.on_core.correction(state)
+        state.on_indenter, state.on_core = self._corrections(state, indenter)
 
     def renew_spread(self, state: SolutionState, indenter: PosedIndenter | None) -> None:
         """Let linear solutions tell how forces follow the pressures at the last `balance`.
@@ -235,9 +243,9 @@ class EquilibriumSystem:
         The gaps' offsets and held directions stay: they belong to the equations, not to their
         derivative.
         """
-        renewed = self.on_indenter.correction(state, indenter).spread
-        state.on_indenter = replace(state.on_indenter, spread=renewed)
-        state.on_core = replace(state.on_core, spread=self.on_core.correction(state).spread)
+        on_indenter, on_core = self._corrections(state, indenter)
+        state.on_indenter = replace(state.on_indenter, spread=on_indenter.spread)
+        state.on_core = replace(state.on_core, spread=on_core.spread)
         self.outer.keep(state.on_indenter, state.indenter_pressure)
         self.inner.keep(state.on_core, state.core_pressure)
 
@@ -317,9 +325,14 @@ class EquilibriumSystem:
             tractions on the indenter (faces, points, 3).
         """
         outer, inner = offsets or (None, None)
-        core, _ = self.inner.updated_pressure(change, inner)
-        skin = self.skin.updated_pressure(vec3s(change))
-        return skin, core, *self.outer.updated_pressure(change, outer)
+        skin, (core, indenter) = self._both(
+            lambda: self.skin.updated_pressure(vec3s(change)),
+            lambda: (
+                self.inner.updated_pressure(change, inner)[0],
+                self.outer.updated_pressure(change, outer),
+            ),
+        )
+        return skin, core, *indenter
 
     def offset_changes(self, change: Floats) -> OffsetChanges:
         """How a change (n,) of the free unknowns changes the gaps' offsets, to first order."""
@@ -362,11 +375,19 @@ class EquilibriumSystem:
         stretch = state.traction / self.contact.tangential_stiffness
         state.anchor[:] = indenter.to_local(self.outer.points_at(state.position) - stretch)
 
-    def _both(self, first: Callable[[], None], second: Callable[[], None]) -> None:
+    def _corrections(
+        self, state: SolutionState, indenter: PosedIndenter | None
+    ) -> tuple[MortarCorrection, MortarCorrection]:
+        """The mortar corrections of a state: on the indenter and on the core."""
+        return self._both(
+            lambda: self.on_indenter.correction(state, indenter),
+            lambda: self.on_core.correction(state),
+        )
+
+    def _both(self, first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
         """Run two halves at once; Warp launches release the interpreter lock."""
         other = self._pool.submit(second)
-        first()
-        other.result()
+        return first(), other.result()
 
     def _sum_up(self, state: SolutionState) -> ForceBalance:
         internal = self._forces[0] + self._forces[1]
