@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.cluster import RayCluster
-from palpate.errors import ConfigError
+from palpate.errors import ConfigError, DatasetError
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.config import FingertipParameters
 from palpate_fem.electrodes.electronics import (
@@ -344,7 +344,17 @@ class FemSimulator:
                 command=COMMAND,
                 packers=packers,
             )
-            return not report.stopped
+            if report.stopped:
+                return False
+            ended = {early.name for early in report.early}
+            missing = {plan.name for plan in plans} - set(SimulationStore.open(store).ids()) - ended
+            if missing:  # claimed by a process that runs it still, or that was lost
+                raise DatasetError(
+                    f"{len(missing)} of {len(plans)} trajectories are not in {store}: another "
+                    "process has claimed them",
+                    remedy="wait until it has ended, and run this again: it goes on",
+                )
+            return True
 
     def open_store(self, path: Path) -> SimulationStore:
         """Open a simulation store."""

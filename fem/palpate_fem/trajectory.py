@@ -212,7 +212,7 @@ def segment_path(
             continue
         at = moves[-1][-1]
         moves.append(_segment_poses(indenter, at, out, segment, surface, step_m, clearance_m))
-        clear = segment.kind == "unload" and segment.amount is None
+        clear = _first_touch(indenter, moves[-1][-1], -out, surface) > 0.0
     return check_path(np.concatenate(moves), source="the path of these segments")
 
 

@@ -153,14 +153,22 @@ def setter_for_signals(event: threading.Event) -> Callable[[], None]:
 
 
 def stop_on_signals(*signals: signal.Signals) -> threading.Event:
-    """An event that each of these signals sets; none given = ``SIGINT`` and ``SIGTERM``."""
+    """An event that each of these signals sets.
+
+    None given = ``SIGINT``, ``SIGTERM`` and, unless the program was started to ignore it (nohup),
+    ``SIGHUP``: the terminal or its connection has ended.
+    """
     stop = threading.Event()
     tell = setter_for_signals(stop)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         tell()
 
-    for number in signals or (signal.SIGINT, signal.SIGTERM):
+    if not signals:
+        signals = (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            signals = (*signals, signal.SIGHUP)
+    for number in signals:
         signal.signal(number, on_signal)
     return stop
 

@@ -201,7 +201,7 @@ def test_read_record(run_example: RunExample, station: Client, records: Path) ->
     copy.parent.mkdir(exist_ok=True)
     while True:
         copy.write_bytes(parts[0].read_bytes())
-        record = recover(copy)
+        record = recover(copy).path
         try:
             (line,) = run_example("read_record.py", str(record))
         except SystemExit:  # no estimate has been written yet

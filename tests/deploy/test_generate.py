@@ -25,6 +25,7 @@ from palpate_deploy.experiment import FemSimulator, specimens_of, with_indenters
 from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.population.members import PAPER, Member, draw_members, write_population
 from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.writer import StoreWriter
 from palpate_training.datasets.experiment import read_experiment, read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import joined
@@ -207,6 +208,37 @@ def test_devices_of_a_cluster_fill_the_same_store(
         )
     assert told == [(1, 2), (2, 2)]
     assert len(SimulationStore.open(tmp_path / STORE).done()) == 2
+
+
+def test_what_another_process_has_claimed_is_not_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a data set of a part would look whole."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "fem"))
+    monkeypatch.setattr("palpate_deploy.experiment.DEFAULT_FACTORY", "fem_fakes:round_finger")
+
+    def simulate() -> bool:
+        return FemSimulator().simulate(
+            SPEC,
+            tmp_path / STORE,
+            workers=1,
+            threads=1,
+            stop=threading.Event(),
+            on_progress=lambda done, total, word: None,
+            devices=("cpu",),
+            slots=2,
+        )
+
+    assert simulate()
+    store = SimulationStore.open(tmp_path / STORE)
+    name = min(store.done())
+    fingertip = store.fingertip()
+    (file,) = (tmp_path / STORE).rglob(f"*{name.rpartition('/')[2]}*.h5")
+    file.unlink()
+    other = StoreWriter(tmp_path / STORE, fingertip, shared=True)
+    with other, other.claim(name), pytest.raises(DatasetError, match=r"1 of 2 .* claimed"):
+        simulate()
+    assert simulate()  # the claim is gone
 
 
 @pytest.mark.parametrize(

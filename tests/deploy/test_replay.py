@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import subprocess
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -13,9 +14,13 @@ from typing import Any
 import pytest
 from tests.gateway.ros_fakes import make_bag
 
+from palpate.bus import Session
 from palpate.bus.topics import ELECTRODES, FEATURES
 from palpate.files.record import read_record
+from palpate.messages import Status
 from palpate.ros.layouts import Dialect
+from palpate_deploy.diagnose.replay import replay, replay_profile
+from palpate_deploy.station.status import ask_status
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -48,6 +53,23 @@ def test_text_log_and_its_record_give_identical_estimates(
     again = _replay(palpate, Path(first["records"][0]), tmp_path / "again")
     assert again["frames"] == 118
     assert _estimates(first) == _estimates(again)
+
+
+def test_slow_answers_do_not_make_a_replay_lossy(
+    text_log: Path, bundle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gateway is gone before its count at the end would have been asked for."""
+
+    def slow(session: Session) -> list[Status]:
+        found = ask_status(session)
+        time.sleep(4.0)
+        return found
+
+    monkeypatch.setattr("palpate_deploy.diagnose.replay.ask_status", slow)
+    profile = replay_profile(text_log, "fast", tmp_path / "out", "features-virtual", rrd=False)
+    account = replay(profile, text_log)
+    assert account.problems == []
+    assert account.published == account.recorded["electrodes"] == 118
 
 
 def test_record_of_a_virtual_finger(

@@ -218,6 +218,11 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
         (("--parameters", "nowhere.json"), "nowhere.json"),
         (("--at-mm", 40, 0), "no pad"),
         (("--store", "store.h5"), ".sim"),
+        (("--sweep", "--store", "a.sim", "--depth-mm", 1), "--depth-mm has no effect"),
+        (("--path", "press 1 mm", "--steps", 3), "--steps has no effect with --path"),
+        (("--poses", "a.csv", "--at-mm", 0, 0), "--at-mm has no effect"),
+        (("--seed", 3), "--seed has no effect with a single press"),
+        (("--stress",), "--store"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(words: tuple[object, ...], said: str) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +167,16 @@ def test_a_store_is_filled_and_resumed(tmp_path: Path) -> None:
         np.testing.assert_allclose(gaps, 0.0, atol=KEPT_M)
     with pytest.raises(DatasetError, match="friction_coefficient"):
         into_store(path, fakes.SLOW, 5, threading.Event())
+
+
+def test_trajectories_of_the_same_names_along_other_paths_are_not_mixed(tmp_path: Path) -> None:
+    """As of another seed of the points, or of other steps."""
+    path, stop = tmp_path / "a.sim", threading.Event()
+    into_store(path, fakes.QUICK, 2, stop)
+    other = [replace(plan, path=plan.path + 1e-4) for plan in plans(3)]
+    with pytest.raises(DatasetError, match="another path"):
+        store_batch(path, batch_of(fakes.QUICK), other)
+    assert len(SimulationStore.open(path).ids()) == 2
 
 
 def test_stopping_keeps_what_has_ended(tmp_path: Path) -> None:

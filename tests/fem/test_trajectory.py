@@ -13,6 +13,7 @@ from palpate.errors import ConfigError, SimulationError
 from palpate.rigid import path_lengths, rotation_matrices
 from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
+from palpate_fem.indenter.distance import signed_distance
 from palpate_fem.indenter.path import PathSegment, check_path, parse_segments
 from palpate_fem.trajectory import (
     ANGLE_RAD,
@@ -233,6 +234,17 @@ def test_steps_are_equal_and_at_most_as_long_as_asked_for() -> None:
     assert len(lengths) == sum(counts)
     for part in np.split(lengths, np.cumsum(counts)[:-1]):
         np.testing.assert_allclose(part[1:], part[1], rtol=0.02)  # a roll's tip speeds up
+
+
+@pytest.mark.parametrize("between", ["unload", "unload 3 mm", "unload, slide 1 mm towards +y"])
+def test_a_press_out_of_the_skin_counts_from_first_contact(between: str) -> None:
+    """However the indenter came to be clear of it."""
+    path = path_of(f"press 1 mm, {between}, press 0.5 mm")
+    gap = signed_distance(
+        make_indenter("sphere_medium"),
+        (FINGER.nodes - path[-1, :3]) @ rotation_matrices(path[-1, 3:]),
+    ).min()
+    assert -0.55e-3 < gap < -0.3e-3
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,7 @@ def test_every_truncation_is_noticed_and_whole_messages_are_recovered(
         part = tmp_path / "cut.mcap.part"
         part.write_bytes(whole[:size])
         try:
-            target = recover(part)
+            target = recover(part).path
         except RecordingError:
             part.unlink()  # nothing readable: nothing was removed, nothing written
             assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.mcap", "run.mcap"]
@@ -141,6 +141,88 @@ def test_every_truncation_is_noticed_and_whole_messages_are_recovered(
         most = max(most, len(sequences))
         target.unlink()
     assert most == 60
+
+
+@pytest.fixture
+def long_record(tmp_path: Path, payload: bytes) -> Path:
+    """Thirty chunks of ten messages."""
+    path = tmp_path / "run.mcap"
+    with RecordWriter(path, {"station": "lab"}) as writer:
+        for i in range(300):
+            writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=1000 + i, sequence=i)
+            if i % 10 == 9:
+                writer.flush()
+    return path
+
+
+@pytest.mark.parametrize("where", ["within a chunk", "over heads of records", "first chunk"])
+@pytest.mark.parametrize("ending", [".mcap", ".mcap.part"])
+def test_what_lies_behind_a_damage_is_recovered_and_nothing_is_deleted(
+    long_record: Path, where: str, ending: str
+) -> None:
+    whole = long_record.read_bytes()
+    with long_record.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunks = [index.chunk_start_offset for index in summary.chunk_indexes]
+    assert len(chunks) == 30
+    begin, size = {
+        "within a chunk": (chunks[10] + 80, 3),
+        "over heads of records": (chunks[10] - 4, chunks[12] - chunks[10]),
+        "first chunk": (chunks[0] + 80, 3),
+    }[where]
+    damaged = long_record.with_name(f"bad{ending}")
+    content = whole[:begin] + bytes(size) + whole[begin + size :]
+    if ending == ".mcap.part":
+        content = content[: chunks[-1] + 100]
+    damaged.write_bytes(content)
+    if where == "first chunk" and ending == ".mcap.part":
+        with pytest.raises(RecordingError):  # the stream has no name, as there is no index yet
+            recover(damaged)
+        assert damaged.read_bytes() == content
+        return
+    found = recover(damaged)
+    sequences = [item.sequence for item in read_record(found.path)]
+    missing = set(range(290)) - set(sequences)
+    assert missing <= set(range(10) if where == "first chunk" else range(90, 140))
+    assert len(sequences) >= 250
+    assert sequences == sorted(sequences)
+    assert found.places >= 1
+    assert found.left_out >= size
+    assert "could not be read" in str(found)
+    kept = damaged if ending == ".mcap" else damaged.with_name("bad.mcap.damaged")
+    assert found.original == kept
+    assert kept.read_bytes() == content
+
+
+def test_recovery_replaces_no_other_file_and_leaves_whole_records(
+    long_record: Path, tmp_path: Path
+) -> None:
+    content = long_record.read_bytes()
+    with pytest.raises(RecordingError, match=r"run\.mcap is whole"):
+        recover(long_record)
+    part = tmp_path / "cut.mcap.part"
+    part.write_bytes(content[:-200])
+    other = tmp_path / "cut.recovered.mcap"
+    other.write_bytes(b"precious")
+    with pytest.raises(RecordingError, match=r"cut\.recovered\.mcap exists.*move it away"):
+        recover(part)
+    assert other.read_bytes() == b"precious"
+    other.unlink()
+    found = recover(part)
+    assert (found.original, part.exists()) == (None, False)
+    # Killed before it had removed the part, a recovery is done again.
+    part.write_bytes(content[:-200])
+    assert summarise(recover(part).path).counts == {KEY: 300}
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.recovered.mcap", "run.mcap"]
+
+
+def test_a_file_without_a_whole_message_is_not_sent_in_a_circle(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    path.write_bytes(b"")
+    with pytest.raises(RecordingError) as caught:
+        recover(path)
+    assert "palpate recover" not in caught.value.remedy
 
 
 def test_flipped_bits_never_raise_anything_but_recording_errors(
@@ -232,7 +314,7 @@ def test_a_record_with_half_a_write_in_it_never_looks_whole(
         writer.close()
     writer.abandon()
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap.part"]
-    assert [item.log_time_ns for item in read_record(recover(writer.part))] == [1]
+    assert [item.log_time_ns for item in read_record(recover(writer.part).path)] == [1]
 
 
 def test_nothing_is_left_of_a_record_that_could_not_begin(
@@ -273,7 +355,7 @@ def test_kill_9_loses_no_more_than_a_flush(tmp_path: Path, examples: dict[str, A
     rest = child.stdout.read().split()
     written = int(rest[-1]) if rest else written
     child.wait()
-    target = recover(path.with_name("run.mcap.part"))
+    target = recover(path.with_name("run.mcap.part")).path
     kept = [item.sequence for item in read_record(target)]
     assert kept == list(range(1, len(kept) + 1))
     assert written - len(kept) <= 30

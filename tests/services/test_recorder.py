@@ -278,7 +278,7 @@ def test_kill_9_loses_a_moment_only(
         process.wait(timeout=30)
         until(lambda: not session.alive())
     (record,) = recover_all(leftovers(tmp_path))
-    kept = [i.sequence for i in read_record(record) if i.address.topic == "electrodes"]
+    kept = [i.sequence for i in read_record(record.path) if i.address.topic == "electrodes"]
     assert kept == list(range(kept[0], kept[-1] + 1))
     assert kept[0] <= 2  # the first may pass before the subscription has reached the publisher
     assert kept[-1] >= 150 - 30  # 0.3 s at 100 Hz

@@ -81,6 +81,22 @@ def test_inspect_knows_mixed_sets(mixed: MixedDataset, tmp_path: Path) -> None:
     assert "12 nodes" in _run("inspect", tmp_path / "m.h5").output
 
 
+def test_an_input_is_not_replaced_where_the_output_is_left_out(
+    path: Path, experiment: ExperimentDataset, tmp_path: Path
+) -> None:
+    write_experiment(tmp_path / "second.h5", experiment)
+    before = (tmp_path / "second.h5").read_bytes()
+    result = _run("features", path, tmp_path / "second.h5")
+    assert isinstance(result.exception, DatasetError)
+    assert "name the file to write" in str(result.exception)
+    assert (tmp_path / "second.h5").read_bytes() == before
+    assert not list(tmp_path.glob(".*"))
+    assert _run("features", path, tmp_path / "f.h5").exit_code == 0
+    assert _run("features", path, tmp_path / "f.h5").exit_code == 0  # made again
+    # Paths of text are paths, too.
+    assert len(open_dataset(str(tmp_path / "f.h5"))) > 0
+
+
 def test_inspect_knows_rows_of_features(
     path: Path, press_data: type[FeatureDataset], tmp_path: Path
 ) -> None:

@@ -145,9 +145,16 @@ def info(file: RecordArgument, json_: JsonOption = False) -> None:
 
 
 def recover(
-    file: Annotated[Path, typer.Argument(metavar="FILE.mcap.part", help="A cut-off record.")],
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE.mcap[.part]", help="A cut-off or damaged record."),
+    ],
 ) -> None:
-    """Recover the complete messages of a record whose writer was killed."""
+    """Write the whole messages of a cut-off or damaged record to NAME.recovered.mcap.
+
+    A .part of which only the end is missing is removed then; one that is damaged otherwise becomes
+    NAME.mcap.damaged. A file of another name stays. What could not be read is told.
+    """
     from palpate_deploy.diagnose.records import recover_record
 
     recover_record(existing_file(file))

@@ -118,6 +118,9 @@ def existing_file(path: Path, *, or_folder: bool = False) -> Path:
     from palpate.errors import ConfigError
 
     if not (path.is_file() or (or_folder and path.is_dir())):
+        if path.exists():
+            kind = "a folder" if path.is_dir() else "no regular file"
+            raise ConfigError(f"{path} is {kind}", remedy="give a file")
         raise ConfigError(f"{path} does not exist", remedy="check the path")
     return path
 

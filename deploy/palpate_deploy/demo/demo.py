@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import threading
 import time
 from pathlib import Path
@@ -51,7 +50,7 @@ def run_demo(seconds: float, out: Path) -> int:
     for bundle in (profile.features.bundle, profile.field.bundle, profile.synthesis.bundle):
         resolve(bundle)  # a missing one is an error before anything starts
     before = set(out.glob("*.mcap"))
-    stop = stop_on_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    stop = stop_on_signals()
     console.print(
         "virtual finger -> features, fields, synthesis -> recorder, for "
         f"{seconds:g} s after the first estimates",

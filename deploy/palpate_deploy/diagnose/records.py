@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import sys
 import threading
@@ -16,8 +17,10 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate.bus import Session
-from palpate.config import LinkConfig, parse_config
-from palpate.errors import ConfigError, printable
+from palpate.bus.query import LONGEST_S
+from palpate.bus.topics import parse_key
+from palpate.config import LinkConfig, check_duration, parse_config
+from palpate.errors import ConfigError, LinkError, printable
 from palpate.files.record import RecordSummary, check_readable, recover, summarise
 from palpate.process import stop_on_signals
 from palpate_deploy.station.logs import cell
@@ -32,8 +35,9 @@ def viewer_command(view: Path) -> str:
     rerun = Path(sys.executable).with_name("rerun")
     if shutil.which("rerun") is None and rerun.exists():
         near = os.path.relpath(rerun)
-        return f"{rerun if near.startswith('..') else near} {view}"
-    return f"rerun {view}"
+        program = str(rerun) if near.startswith("..") else near
+        return shlex.join((program, str(view)))
+    return shlex.join(("rerun", str(view)))
 
 
 def record_station(
@@ -42,11 +46,15 @@ def record_station(
     """Record until ``duration_s`` have passed (0 = Ctrl-C), then print what was recorded.
 
     Raises:
-        LinkError: There is no router.
-        ConfigError: An unknown topic.
+        LinkError: There is no router, or nothing came of the station or of the sensor that is
+            named; the record is there, though.
+        ConfigError: An unknown topic, or no duration.
         RecordingError: The folder cannot be made.
     """
     from palpate_services.config import EVERYTHING, RecorderConfig
+
+    if duration_s:
+        check_duration(duration_s, "--duration-s", most=LONGEST_S)
     from palpate_services.recorder.service import run_recorder
 
     config = parse_config(RecorderConfig, {**EVERYTHING, **settings}, where="command line")
@@ -59,9 +67,20 @@ def record_station(
         timer.start()
     until = f"for {duration_s:g} s" if duration_s else "until Ctrl-C"
     print(f"recording station {station} to {config.out}/ {until}", flush=True)
-    run_recorder(config, link, station, stop, instance=f"record-{os.getpid()}")
-    for path in sorted(set(config.out.glob("*.mcap")) - before):
-        print_contents(path)
+    instance = f"record-{os.getpid()}"
+    own = f"recorder/{instance}"
+    run_recorder(config, link, station, stop, instance=instance)
+    written = sorted(set(config.out.glob("*.mcap")) - before)
+    keys = [parse_key(key) for path in written for key in print_contents(path).counts]
+    if config.sensor != "*" and not any(key.sensor == config.sensor for key in keys):
+        raise LinkError(
+            f"nothing came of sensor {config.sensor!r}",
+            remedy="see which sensors there are: palpate status",
+        )
+    if all(key.sensor == own for key in keys):  # its status
+        raise LinkError(
+            f"nothing came of station {station!r}", remedy="see what runs: palpate status"
+        )
 
 
 def show_info(path: Path, *, as_json: bool) -> None:
@@ -130,13 +149,16 @@ def review_path(
     ``trajectories`` and ``most`` are for stores only, ``bundles`` for records: see the command.
 
     Raises:
-        ConfigError: There is no such path or bundle.
+        ConfigError: There is no such path or bundle, or the name of a file to write has another
+            ending than its kind.
         RecordingError: The record is damaged or not palpate's.
         DatasetError: The store is damaged, or has none of these trajectories.
         MissingExtraError: Rerun, h5py or matplotlib is not installed.
     """
     if not path.exists():
         raise ConfigError(f"{path} does not exist", remedy="check the path")
+    _check_ending(view, ".rrd", "--out")
+    _check_ending(picture, ".png", "--png")
     from palpate.files.simulation_store import is_simulation_store
 
     if is_simulation_store(path):
@@ -159,11 +181,19 @@ def review_path(
         print(f"look at it: {viewer_command(written)}")
 
 
+def _check_ending(path: Path | None, ending: str, option: str) -> None:
+    """A file of another ending may be anything, e.g. the record itself; it would be replaced."""
+    if path is not None and path.suffix != ending:
+        raise ConfigError(
+            f"{option} {path} does not end in {ending}", remedy=f"name a file NAME{ending}"
+        )
+
+
 def write_foxglove(record: Path, out: Path, *, bundles: Sequence[str] = ()) -> None:
     """Write a record for Foxglove, and print what is in its scenes.
 
     Raises:
-        ConfigError: It would replace the record, or there is no such bundle.
+        ConfigError: It would replace a record, or there is no such bundle.
         RecordingError: The record is damaged or not palpate's.
         DatasetError: The disk refused.
         MissingExtraError: Foxglove's messages are not installed.
@@ -267,9 +297,12 @@ def _draw_store(path: Path, picture: Path, trajectories: Sequence[str]) -> None:
 
 
 def recover_record(part: Path) -> None:
-    """Write ``NAME.recovered.mcap`` from ``NAME.mcap.part``.
+    """Write ``NAME.recovered.mcap``, and print what it holds and what was left out.
 
     Raises:
-        RecordingError: Nothing in it can be read.
+        RecordingError: It is whole or being written, nothing in it can be read, or a file of the
+            new record's name is there.
     """
-    print_contents(recover(part))
+    found = recover(part)
+    print_contents(found.path)
+    print(found)

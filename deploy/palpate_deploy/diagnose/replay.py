@@ -11,6 +11,7 @@ import contextlib
 import json
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from palpate.bus import Session
-from palpate.bus.topics import ELECTRODES, FEATURES
+from palpate.bus import Delivery, Session, Subscriber
+from palpate.bus.topics import ELECTRODES, FEATURES, STATUS
 from palpate.errors import LinkError, PalpateError, RecordingError, printable
 from palpate.files.record import summarise
-from palpate.messages import ServiceState
+from palpate.messages import ServiceState, Status
 from palpate_deploy.diagnose.records import viewer_command
 from palpate_deploy.station.host import join, private_profile
 from palpate_deploy.station.logs import DEVICE, FAILED, print_error
@@ -38,6 +39,7 @@ class ReplayAccount:
 
     ``gateway`` and ``features`` are the last counters of these services, ``recorded`` the messages
     by topic, read back from ``records``, the files written; ``error`` is why the file ended early.
+    ``counted``: whether ``gateway`` are its counters at the end.
     """
 
     file: Path
@@ -48,6 +50,7 @@ class ReplayAccount:
     records: list[Path] = field(default_factory=list)
     error: PalpateError | None = None
     exit_status: int = 0
+    counted: bool = False
 
     @property
     def published(self) -> int:
@@ -77,6 +80,10 @@ class ReplayAccount:
         found = []
         frames = self.recorded.get(ELECTRODES.name, 0)
         estimates = self.recorded.get(FEATURES.name, 0)
+        if not self.counted:
+            found.append(
+                f"the gateway ended after at least {self.published} frames, and did not say"
+            )
         if not self.published:
             found.append("no frame was published")
         if frames != self.published:
@@ -302,15 +309,20 @@ def _follow(
 ) -> int:
     """Update the counters until gateway and consumers have ended; the gateway's exit status."""
     settled_by = float("inf")
+    # An answer may take longer than the gateway stays after its last frame, so it is listened to.
+    told = session.subscriber(STATUS, service="gateway", delivery=Delivery.QUEUE)
     while True:
         children.check(["router", "features", "recorder"])
+        exit_status = children.status("gateway")
         statuses = {status.service: status for status in ask_status(session)}
         counters = {service: dict(status.counters) for service, status in statuses.items()}
-        account.gateway = counters.get("gateway", account.gateway)
+        for status in (*_waiting(told), *filter(None, (statuses.get("gateway"),))):
+            if not account.counted:
+                account.gateway = dict(status.counters)
+                account.counted = status.state is ServiceState.FINISHED
         account.features = counters.get("features", account.features)
         frames = account.published
         bar.update(task, completed=frames, frames=frames)
-        exit_status = children.status("gateway")
         # The gateway ends before its last frames are estimated and recorded; what is still missing
         # after the wait is reported as a loss.
         if exit_status is not None or (
@@ -318,11 +330,19 @@ def _follow(
         ):
             settled_by = min(settled_by, time.monotonic() + _SETTLED_S)
             recorded = counters.get("recorder", {}).get("recorded_electrodes", 0)
-            settled = min(account.answered, recorded) >= frames
+            counted = account.counted or bool(exit_status)
+            settled = counted and min(account.answered, recorded) >= frames
             if exit_status is not None and (settled or time.monotonic() > settled_by):
                 bar.update(task, total=max(frames, 1), completed=max(frames, 1), frames=frames)
                 return exit_status
         time.sleep(_POLL_S)
+
+
+def _waiting(statuses: Subscriber[Status]) -> Iterator[Status]:
+    """Those that have arrived."""
+    with contextlib.suppress(PalpateError):
+        while True:
+            yield statuses.next(0.0).message
 
 
 def _progress(show: bool) -> Progress:

@@ -132,6 +132,11 @@ def ask_status(session: Session, *, timeout_s: float = _ANSWER_S) -> list[Status
     return [answer for answer in answers if not isinstance(answer, PalpateError)]
 
 
+def nothing_runs(station: str) -> str:
+    """What a station is told of which no process answers."""
+    return f"no process of station {station!r} runs: start it with `palpate up`"
+
+
 def show_status(
     link: LinkConfig,
     station: str,
@@ -241,7 +246,7 @@ def _table(station: str, census: Iterable[ProcessReport]) -> Table:
             shown_counters(status),
         )
     if not table.row_count:
-        table.caption = f"no process of station {station!r} runs: start it with `palpate up`"
+        table.caption = nothing_runs(station)
     return table
 
 

@@ -31,7 +31,7 @@ from palpate_deploy.station.activity import (
 )
 from palpate_deploy.station.logs import FAILED, cell
 from palpate_deploy.station.observation import ObservedProcess, StationObserver
-from palpate_deploy.station.status import duration_text
+from palpate_deploy.station.status import duration_text, nothing_runs
 from palpate_deploy.station.troubles import (
     Trouble,
     ask_through_router,
@@ -94,6 +94,8 @@ def run_top(
                 console.print(screen(station, observed, console.width))
             found = troubles(one.report for one in observed)
             nobody = all((one.report.service, one.report.instance) == ROUTER for one in observed)
+            if nobody and not as_json:
+                console.print(nothing_runs(station), markup=False)
             return FAILED if found or nobody else 0
         with _keys() as key, Live(console=console, screen=True, auto_refresh=False) as live:
             while True:

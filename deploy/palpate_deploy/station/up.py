@@ -58,7 +58,7 @@ def run_up(profile: Profile, name: str) -> int:
     manager = ServiceManager()
     # A service manager that finds it hanging asks where, before it kills it.
     faulthandler.register(signal.SIGUSR1, all_threads=True)
-    stop = stop_on_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    stop = stop_on_signals()
     end_with_parent()
     with Supervisor(profile, name) as supervisor:
         console.print(

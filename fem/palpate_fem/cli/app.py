@@ -147,6 +147,7 @@ def _example(*lines: str) -> str:
     )
 )
 def run(
+    context: typer.Context,
     indenter: Annotated[
         list[str] | None, typer.Option("--indenter", help="Indenter; with --sweep repeatable.")
     ] = None,
@@ -243,6 +244,7 @@ def run(
                 devices=tuple(device or ()),
                 slots=slots,
                 ray=ray,
+                given=_given(context),
             ),
             model_of(
                 mesh=mesh,
@@ -257,6 +259,16 @@ def run(
             ),
             workers=workers,
         )
+    )
+
+
+def _given(context: typer.Context) -> frozenset[str]:
+    """Parameters of a command that were given, not left at their defaults."""
+    source = context.get_parameter_source
+    return frozenset(
+        name
+        for name in context.params
+        if (found := source(name)) is not None and found.name != "DEFAULT"
     )
 
 
@@ -553,7 +565,7 @@ def fit(
 @units_app.command(epilog="Example: palpate fem units draw 20 --seed 1 --out drawn.json")
 def draw(
     count: Annotated[int, typer.Argument(metavar="N", help="Number of specimens.")],
-    seed: Annotated[int, typer.Option(help="The same seed draws the same specimens.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed draws the same specimens.")] = 0,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.json", help="Where to write them.")
     ] = None,

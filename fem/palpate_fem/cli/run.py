@@ -68,9 +68,27 @@ _COLUMNS = (
 _SHOWN_EARLY = 40
 
 
+_PRESS = "a single press"
+_OF_WAYS = {
+    "depth_mm": (_PRESS,),
+    "angle_deg": (_PRESS,),
+    "azimuth_deg": (_PRESS,),
+    "at_mm": (_PRESS, "--path"),
+    "steps": (_PRESS, "--sweep"),
+    "step_mm": ("--path",),
+    "points": ("--sweep",),
+    "angled": ("--sweep",),
+    "seed": ("--sweep",),
+}
+"""What each option is for, by the name of the command's parameter."""
+
+
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """Options of ``palpate fem run``, in SI, with the names that they have there."""
+    """Options of ``palpate fem run``, in SI, with the names that they have there.
+
+    ``given``: names of the command's parameters that were given, not left at their defaults.
+    """
 
     indenters: tuple[str, ...]
     depth_m: float
@@ -93,6 +111,7 @@ class RunOptions:
     devices: tuple[str, ...] = ()
     slots: int | None = None
     ray: str | None = None
+    given: frozenset[str] = frozenset()
 
     def check(self) -> None:
         """Refuse what can be refused before a fingertip is built.
@@ -106,6 +125,18 @@ class RunOptions:
         given = [name for name, value in ways.items() if value]
         if len(given) > 1:
             raise ConfigError(f"{' and '.join(given)} exclude each other", remedy="give one")
+        way = given[0] if given else _PRESS
+        for name, belongs_to in _OF_WAYS.items():
+            if name in self.given and way not in belongs_to:
+                raise ConfigError(
+                    f"--{name.replace('_', '-')} has no effect with {way}",
+                    remedy=f"leave it out; it is for {' and '.join(belongs_to)}",
+                )
+        if self.stress and self.store is None:
+            raise ConfigError(
+                "--stress is kept in a store, which is not given",
+                remedy="add --store NAME.sim, or leave --stress out",
+            )
         if self.sweep and self.store is None:
             raise ConfigError(
                 "a sweep takes long and its results must be stored", remedy="give --store NAME.sim"

@@ -99,7 +99,7 @@ def check_path(path: ArrayLike, *, source: str = "path", first_line: int | None 
     return poses
 
 
-def read_path(file: Path) -> Floats:
+def read_path(file: str | Path) -> Floats:
     """Read a path from a file with the columns x_m y_m z_m qw qx qy qz.
 
     By its suffix: ``.json`` holds an object with a list of numbers for each column, ``.npz`` an
@@ -111,7 +111,7 @@ def read_path(file: Path) -> Floats:
     Raises:
         ConfigError: It cannot be read, or is not such a file; names the line or the column.
     """
-    header = ",".join(COLUMNS)
+    file, header = Path(file), ",".join(COLUMNS)
     try:
         with file.open("rb") as opened:
             content = opened.read(FILE_BYTES_MOST + 1)

@@ -18,7 +18,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from palpate.errors import ConfigError, PalpateError, RemoteError, SimulationError
+import numpy as np
+
+from palpate.errors import (
+    ConfigError,
+    DatasetError,
+    PalpateError,
+    RemoteError,
+    SimulationError,
+)
 from palpate.process import Closing
 from palpate_fem.arrays import Floats
 from palpate_fem.calibration.runs import PlannedPath, SimulatedRun
@@ -40,11 +48,13 @@ from palpate_fem.service.packing import PackingProcesses
 from palpate_fem.service.pool import WorkerPool
 from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.files import StoreTakenError
+from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter, TrajectoryClaim
 from palpate_fem.trajectory import PlannedIndentation
 
 _POLL_S = 0.1
 _OWN_FILES = 256  # of libraries, processes and results on their way
+_SAME_PATH = 1e-6  # [m, 1]; stores of other processors differ by rounding
 FAILED = "failed"
 """Outcome, in a report, of a trajectory that could not be run or whose worker died."""
 
@@ -315,7 +325,8 @@ def sweep_into_store(
             a trajectory is then on the disk soon after it was reported. 0 = this process does.
 
     Returns:
-        The report, and the number of trajectories that the store held before.
+        The report, and the number of trajectories that the store held before. What another process
+        had claimed is in neither: it runs there, or was lost with it.
 
     Raises:
         DatasetError: The store belongs to another fingertip, is damaged or in use, or the disk
@@ -338,6 +349,7 @@ def sweep_into_store(
         )
         done = store.done()
         left = [plan for plan in plans if plan.name not in done]
+        _check_paths(path, [plan for plan in plans if plan.name in done])
         claims: dict[str, TrajectoryClaim] = {}
         unmade: list[EarlyEnd] = []
 
@@ -373,6 +385,27 @@ def sweep_into_store(
         report.outcomes[FAILED] += len(unmade)
         report.early += unmade
     return report, len(plans) - len(left)
+
+
+def _check_paths(store: Path, known: Sequence[TrajectoryPlan]) -> None:
+    """Check that trajectories that are there, three of them, have the paths that are planned.
+
+    Other points, steps or depths change the path of all.
+
+    Raises:
+        DatasetError: One has another path.
+    """
+    if not known:
+        return
+    held = SimulationStore.open(store)
+    for number in sorted({0, len(known) // 2, len(known) - 1}):
+        plan, path = known[number], held.summary(known[number].name).path
+        if path.shape != plan.path.shape or not np.allclose(path, plan.path, atol=_SAME_PATH):
+            raise DatasetError(
+                f"{store}: {plan.name} has another path there than is planned now",
+                remedy="give the points, seed, steps and depths that it was made with, or another "
+                "file",
+            )
 
 
 def allow_open_files(count: int) -> None:

@@ -124,13 +124,31 @@ def opened(
 def hdf5_written_whole(path: Path, *, extra: str) -> Iterator[h5py.File]:
     """An HDF5 file to write to, which gets its name when the block ends without an error.
 
+    It may replace a file of the same schema only: another one was named by mistake, e.g. the last
+    input because the name of the output was left out.
+
     Raises:
-        DatasetError: The disk refused.
+        DatasetError: The disk refused, or another kind of file is there.
         MissingExtraError: h5py is not installed.
     """
     h5 = h5py_module(extra)
     with written_whole(path) as partial, h5.File(partial, "w") as file:
         yield file
+        _check_replaced(path, text(file.attrs.get("schema", "")), extra)
+
+
+def _check_replaced(path: Path, schema: str, extra: str) -> None:
+    if not path.exists():
+        return
+    try:
+        found = schema_of(path, extra=extra)
+    except DatasetError:
+        found = ""
+    if found != schema:
+        raise DatasetError(
+            f"{path} is there and is no {schema}, but {found or 'another kind of file'}",
+            remedy="name the file to write, last; move this one away if it may be replaced",
+        )
 
 
 def schema_of(path: Path, *, extra: str) -> str:

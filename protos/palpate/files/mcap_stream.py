@@ -4,20 +4,24 @@ A file of a stranger may say that a record has a petabyte, or expand to a thousa
 So every size is checked before anything is read or expanded, and what all chunks together expand to
 is bounded by the size of the file. At no time more than one chunk is in memory.
 
-Errors are ``ValueError`` with what is wrong and where, and ``EOFError`` where the file ends early.
+Errors are ``ValueError`` with what is wrong and where, and ``EOFError`` where the file ends early;
+bytes that are no MCAP may raise any of `DAMAGED`. Whoever wants to save what is left of a damaged
+file is told of each place that cannot be read, and reading goes on behind it.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from typing import IO, NamedTuple
 
 import zstandard
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Footer, Metadata, Schema, Statistics
 
@@ -51,6 +55,37 @@ _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _TIME_MAX_NS = 2**63  # the year 2262; later ones do not fit the arrays of times
 _END_BYTES = _HEAD.size + 20 + len(_MAGIC)  # footer and magic
+_PASSED_OVER_MAX = CHUNK_BYTES_MAX  # of one record, where a file is known to be damaged [bytes]
+_PACKED_CHUNK = re.compile(rb"\x06.{36}(?:\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4)", re.DOTALL)
+_LOOK_BYTES = 1 << 20
+
+DAMAGED = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    EOFError,
+    ValueError,
+    LookupError,
+    OverflowError,
+    MemoryError,
+    RuntimeError,  # of LZ4
+)
+"""What the reader raises on bytes that are not MCAP."""
+
+
+class _BoundError(ValueError):
+    """A whole file exceeds a bound, so that to read on would be what the bound forbids."""
+
+
+class Damage(NamedTuple):
+    """A place of a file that cannot be read: where it begins, its bytes, and what is wrong."""
+
+    at: int
+    size: int
+    problem: str
+
+
+OnDamage = Callable[[Damage], None]
 
 
 class McapMessage(NamedTuple):
@@ -66,32 +101,43 @@ class McapMessage(NamedTuple):
 Part = Schema | Channel | McapMessage | Metadata
 
 
-def parts_of(file: IO[bytes]) -> Iterator[Part]:
+def parts_of(file: IO[bytes], on_damage: OnDamage | None = None) -> Iterator[Part]:
     """Schemas, channels, messages and metadata in order of writing; schemas without their data.
 
+    With ``on_damage`` what cannot be read is told to it, and the chunks behind it are read, too.
+
     Raises:
-        ValueError: It is no MCAP file, is damaged, or exceeds a bound.
+        ValueError: It is no MCAP file, exceeds a bound or, without ``on_damage``, is damaged.
         EOFError: The end is missing.
     """
     budget = _Budget(os.fstat(file.fileno()).st_size)
     if file.read(len(_MAGIC)) != _MAGIC:
         raise ValueError("it is no MCAP file")
-    for opcode, data, at in _records(file):
-        if opcode == Opcode.CHUNK:
-            yield from _of_chunk(_chunk(data, at), at, budget)
-        elif opcode == Opcode.MESSAGE:
-            budget.spend(_MESSAGE_COST, at)
-            yield _message(data, at)
-        elif opcode == Opcode.SCHEMA:
-            yield budget.schema(data, at)
-        elif opcode == Opcode.CHANNEL:
-            yield budget.channel(data, at)
-        elif opcode == Opcode.METADATA:
-            yield Metadata.read(ReadDataStream(BytesIO(data)))
-        elif opcode == Opcode.FOOTER:
+    for opcode, data, at in _records(file, on_damage):
+        if opcode == Opcode.FOOTER:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise EOFError("the end is missing")
             return
+        try:
+            yield from _parts(opcode, data, at, budget)
+        except DAMAGED as error:
+            if on_damage is None or isinstance(error, _BoundError):
+                raise
+            on_damage(Damage(at, _HEAD.size + len(data), str(error) or type(error).__name__))
+
+
+def _parts(opcode: int, data: bytes, at: int, budget: _Budget) -> Iterator[Part]:
+    if opcode == Opcode.CHUNK:
+        yield from _of_chunk(_chunk(data, at), at, budget)
+    elif opcode == Opcode.MESSAGE:
+        budget.spend(_MESSAGE_COST, at)
+        yield _message(data, at)
+    elif opcode == Opcode.SCHEMA:
+        yield budget.schema(data, at)
+    elif opcode == Opcode.CHANNEL:
+        yield budget.channel(data, at)
+    elif opcode == Opcode.METADATA:
+        yield Metadata.read(ReadDataStream(BytesIO(data)))
 
 
 def check_summary(file: IO[bytes]) -> None:
@@ -144,7 +190,7 @@ class _Budget:
     def spend(self, size: int, at: int) -> None:
         self._left -= size
         if self._left < 0:
-            raise ValueError(
+            raise _BoundError(
                 f"its chunks expand to more than {self._allowed:,} bytes, found at byte {at:,}"
             )
 
@@ -162,34 +208,71 @@ class _Budget:
 def _note(known: set[int], number: int, what: str, at: int) -> None:
     known.add(number)
     if len(known) > CHANNELS_MAX:
-        raise ValueError(f"it has more than {CHANNELS_MAX} {what}, found at byte {at:,}")
+        raise _BoundError(f"it has more than {CHANNELS_MAX} {what}, found at byte {at:,}")
 
 
-def _records(file: IO[bytes]) -> Iterator[tuple[int, bytes, int]]:
+def _records(
+    file: IO[bytes], on_damage: OnDamage | None = None
+) -> Iterator[tuple[int, bytes, int]]:
     """Opcode, content and place of each record; content only of the kinds in ``_BYTES_MAX``."""
+    file_bytes = os.fstat(file.fileno()).st_size
     while True:
         at = file.tell()
-        head = file.read(_HEAD.size)
-        if len(head) < _HEAD.size:
-            raise EOFError("the end is missing")
-        opcode, size = _HEAD.unpack(head)
-        if opcode == 0:
-            raise ValueError(f"there is no record at byte {at:,}")
-        most = _BYTES_MAX.get(opcode)
-        if most is None:
-            if size > os.fstat(file.fileno()).st_size:
-                raise ValueError(f"the record at byte {at:,} says that it has {size:,} bytes")
-            # Attachments and indices; to read them would take as long as they say they are.
-            file.seek(size, os.SEEK_CUR)
+        try:
+            found = _record(file, at, file_bytes if on_damage is None else _PASSED_OVER_MAX)
+        except (ValueError, EOFError) as error:
+            if on_damage is None:
+                raise
+            behind = _next_chunk(file, at + 1)
+            if behind is not None or not isinstance(error, EOFError):
+                size = (file_bytes if behind is None else behind) - at
+                on_damage(Damage(at, size, str(error)))
+            if behind is None:
+                raise EOFError("the end is missing") from error
+            file.seek(behind)
             continue
-        if size > most:
-            raise ValueError(
-                f"the record at byte {at:,} says that it has {size:,} bytes, {most:,} are allowed"
-            )
-        data = file.read(size)
-        if len(data) < size:
-            raise EOFError("the end is missing")
-        yield opcode, data, at
+        if found is not None:
+            yield *found, at
+
+
+def _record(file: IO[bytes], at: int, passed_over_max: int) -> tuple[int, bytes] | None:
+    """Opcode and content of the next record; None = a kind that is passed over."""
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        raise EOFError("the end is missing")
+    opcode, size = _HEAD.unpack(head)
+    if opcode == 0:
+        raise ValueError(f"there is no record at byte {at:,}")
+    most = _BYTES_MAX.get(opcode)
+    if most is None:
+        if size > passed_over_max:
+            raise ValueError(f"the record at byte {at:,} says that it has {size:,} bytes")
+        # Attachments and indices; to read them would take as long as they say they are.
+        file.seek(size, os.SEEK_CUR)
+        return None
+    if size > most:
+        raise ValueError(
+            f"the record at byte {at:,} says that it has {size:,} bytes, {most:,} are allowed"
+        )
+    data = file.read(size)
+    if len(data) < size:
+        raise EOFError("the end is missing")
+    return opcode, data
+
+
+def _next_chunk(file: IO[bytes], start: int) -> int | None:
+    """Where the next packed chunk begins by its looks; whether it is one, its checksum tells."""
+    kept, at = b"", start
+    file.seek(start)
+    while block := file.read(_LOOK_BYTES):
+        data = kept + block
+        for found in _PACKED_CHUNK.finditer(data):
+            _, size = _HEAD.unpack_from(data, found.start())
+            if size <= CHUNK_BYTES_MAX:
+                return at + found.start()
+        kept = data[-64:]  # the head of a chunk may lie across two blocks
+        at += len(data) - len(kept)
+    return None
 
 
 def _chunk(data: bytes, at: int) -> Chunk:

@@ -11,7 +11,6 @@ import contextlib
 import fcntl
 import itertools
 import os
-import struct
 import tempfile
 import time
 from collections import Counter
@@ -21,24 +20,33 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
-import zstandard
 from google.protobuf import descriptor_pb2
 from google.protobuf.message import Message as PbMessage
 from mcap.data_stream import RecordBuilder
-from mcap.exceptions import McapError
 from mcap.records import Channel, ChunkIndex, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, StreamAddress, parse_key
 from palpate.errors import ConfigError, RecordingError, WireError, printable
 from palpate.files.bounded import open_regular
-from palpate.files.mcap_stream import CHANNELS_MAX, McapMessage, check_summary, parts_of
+from palpate.files.mcap_stream import (
+    CHANNELS_MAX,
+    DAMAGED,
+    Damage,
+    McapMessage,
+    OnDamage,
+    check_summary,
+    parts_of,
+)
 
 FLUSH_S = 0.1
 """Messages reach the operating system after this time [s]; kill -9 costs no more than this."""
 
 METADATA = "palpate"
 """Name of the MCAP metadata record that holds the facts of a run."""
+
+DAMAGED_ENDING = ".damaged"
+"""Of a record from which all that could be read was recovered: ``NAME.mcap.damaged``."""
 
 _CHUNK_BYTES = 1 << 20
 
@@ -270,21 +278,6 @@ class RecordWriter:
             self.abandon()
 
 
-# What the reader raises on bytes that are not MCAP.
-_DAMAGED = (
-    McapError,
-    zstandard.ZstdError,
-    struct.error,
-    EOFError,
-    ValueError,
-    LookupError,
-    OverflowError,
-    MemoryError,
-    RuntimeError,  # of LZ4
-    OSError,
-)
-
-
 @dataclass(frozen=True, slots=True)
 class RecordItem:
     """One recorded message.
@@ -308,10 +301,13 @@ class RecordItem:
     sequence: int
 
 
-def read_record(path: Path, *, allow_partial: bool = False) -> Iterator[RecordItem]:
+def read_record(
+    path: Path, *, allow_partial: bool = False, on_damage: OnDamage | None = None
+) -> Iterator[RecordItem]:
     """Messages of a record in order of writing.
 
-    With ``allow_partial`` the end may be missing, as of ``NAME.mcap.part``; whole messages come.
+    With ``allow_partial`` the end may be missing, as of ``NAME.mcap.part``, and what is damaged is
+    left out; ``on_damage`` is told of it.
 
     Raises:
         RecordingError: Not a record of palpate, or damaged (after the messages before the damage).
@@ -319,11 +315,19 @@ def read_record(path: Path, *, allow_partial: bool = False) -> Iterator[RecordIt
     schemas: dict[int, Schema] = {}
     channels: dict[int, tuple[str, StreamAddress, str]] = {}
     count = 0
-    complete = False
+    complete = searched = False
+    tell = on_damage or _ignore
     try:
         with open_regular(path) as stream:
-            for part in parts_of(stream):
+            for part in parts_of(stream, tell if allow_partial else None):
                 if isinstance(part, McapMessage):
+                    if allow_partial and part.channel_id not in channels:
+                        # Its chunk is damaged, but a whole file says it once more at its end.
+                        if not searched:
+                            searched, channels = True, _all_channels(path) | channels
+                        if part.channel_id not in channels:
+                            tell(Damage(0, len(part.data), "a message of a stream without name"))
+                            continue
                     key, address, schema = channels[part.channel_id]
                     count += 1
                     yield RecordItem(
@@ -342,12 +346,17 @@ def read_record(path: Path, *, allow_partial: bool = False) -> Iterator[RecordIt
         complete = True
     except FileNotFoundError as error:
         raise RecordingError(f"{path} does not exist", remedy="check the path") from error
+    except OSError as error:
+        raise RecordingError(
+            f"{path} cannot be read: {error.strerror or error}",
+            remedy="check the path and the disk",
+        ) from error
     except WireError as error:
         raise RecordingError(f"{path}: {error.problem}", remedy=error.remedy) from error
-    except _DAMAGED as error:
+    except DAMAGED as error:
         if isinstance(error, RecordingError):
             raise
-        if not (allow_partial and channels):
+        if not (allow_partial and channels and isinstance(error, EOFError)):
             raise RecordingError(
                 f"{path} is damaged or cut off after {count} messages: "
                 f"{printable(str(error)) or type(error).__name__}",
@@ -357,6 +366,25 @@ def read_record(path: Path, *, allow_partial: bool = False) -> Iterator[RecordIt
         raise RecordingError(
             f"{path} holds no palpate messages", remedy="give a record written by palpate"
         )
+
+
+def _ignore(damage: Damage) -> None:
+    """What is left out is of no interest."""
+
+
+def _all_channels(path: Path) -> dict[int, tuple[str, StreamAddress, str]]:
+    """Streams by their number, wherever in a damaged file they are named."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, tuple[str, StreamAddress, str]] = {}
+    with open_regular(path) as stream, contextlib.suppress(EOFError):
+        for part in parts_of(stream, _ignore):
+            if isinstance(part, Schema):
+                schemas[part.id] = part
+            elif (
+                isinstance(part, Channel) and part.id not in channels and part.schema_id in schemas
+            ):
+                channels[part.id] = _channel(path, part, schemas)
+    return channels
 
 
 def _channel(
@@ -449,7 +477,7 @@ def metadata_of(path: Path) -> dict[str, str]:
                     return dict(part.metadata)
                 if isinstance(part, McapMessage):
                     break
-    except _DAMAGED:
+    except (*DAMAGED, OSError):
         return {}
     return {}
 
@@ -463,7 +491,7 @@ def check_readable(path: Path) -> None:
     try:
         with open_regular(path) as stream:
             check_summary(stream)
-    except _DAMAGED as error:
+    except (*DAMAGED, OSError) as error:
         raise RecordingError(f"{path}: {error}", remedy="recover it") from error
 
 
@@ -486,21 +514,78 @@ def is_being_written(part: Path) -> bool:
     return False
 
 
-def recover(part: Path) -> Path:
-    """Rewrite the whole messages of a cut-off record as ``NAME.recovered.mcap``; remove the part.
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """What was saved of a record.
+
+    Attributes:
+        path: The new record.
+        original: Where the damaged one is; None = only its end was missing, and it is removed.
+        places: How many places could not be read.
+        left_out: Their bytes, as they are in the file.
+        first: The first of them.
+    """
+
+    path: Path
+    original: Path | None = None
+    places: int = 0
+    left_out: int = 0
+    first: Damage | None = None
+
+    def __str__(self) -> str:
+        """What was left out, and where the original is; for people."""
+        if self.first is None:
+            return f"{self.path}: all whole messages" + (
+                "" if self.original is None else f"; the original stays: {self.original}"
+            )
+        return (
+            f"{self.path}: {self.left_out:,} bytes could not be read (places: {self.places}), the "
+            f"first at byte {self.first.at:,} ({printable(self.first.problem)}); the original is "
+            f"kept: {self.original}"
+        )
+
+
+def recover(part: Path) -> Recovery:
+    """Write the whole messages of a cut-off or damaged record to ``NAME.recovered.mcap``.
+
+    A ``NAME.mcap.part`` of which only the end is missing is removed; one that is damaged otherwise
+    becomes ``NAME.mcap.damaged``. A file of another name stays as it is.
 
     Raises:
-        RecordingError: It is still being written, or nothing in it can be read.
+        RecordingError: It is still being written, it is whole, nothing in it can be read, or there
+            is another file of the new record's name.
     """
     if is_being_written(part):
         raise RecordingError(
             f"{part} is being written", remedy="stop its recorder first; it closes the record"
         )
+    unfinished = part.name.endswith(".part")
+    if not unfinished and _is_whole(part):
+        raise RecordingError(
+            f"{part} is whole", remedy="there is nothing to recover; use it as it is"
+        )
     name = part.name.removesuffix(".part").removesuffix(".mcap")
     target = part.with_name(f"{name}.recovered.mcap")
+    # A recovery that was killed after its last step but one has left both.
+    if target.exists() and metadata_of(target).get("recovered_from") != part.name:
+        raise RecordingError(
+            f"{target} exists and would be replaced", remedy="move it away and recover again"
+        )
+    damages: list[Damage] = []
+    places = left_out = 0
+
+    def on_damage(damage: Damage) -> None:
+        nonlocal places, left_out
+        places, left_out = places + 1, left_out + damage.size
+        if not damages:
+            damages.append(damage)
+
     facts = {**metadata_of(part), "recovered_from": part.name}
-    items = read_record(part, allow_partial=True)
-    first = next(items, None)
+    items = read_record(part, allow_partial=True, on_damage=on_damage)
+    try:
+        first = next(items, None)
+    except RecordingError as error:
+        raise RecordingError(error.problem, remedy="nothing in it can be recovered") from error
     if first is None:
         raise RecordingError(
             f"{part} holds no whole message", remedy="there is nothing to recover; delete it"
@@ -515,5 +600,22 @@ def recover(part: Path) -> Path:
                 publish_time_ns=item.publish_time_ns,
                 sequence=item.sequence,
             )
-    part.unlink()
-    return target
+    original: Path | None = part
+    if unfinished and not damages:
+        part.unlink()
+        original = None
+    elif unfinished:
+        original = part.with_name(part.name.removesuffix(".part") + DAMAGED_ENDING)
+        os.replace(part, original)
+    return Recovery(target, original, places, left_out, damages[0] if damages else None)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a finished record can be read to its end, and its index is sound."""
+    try:
+        for _ in read_record(path):
+            pass
+        check_readable(path)
+    except RecordingError:
+        return False
+    return True

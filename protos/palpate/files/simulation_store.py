@@ -63,13 +63,14 @@ class SimulationFiles:
         self._whole = path.is_file()
 
     @classmethod
-    def open(cls, path: Path) -> Self:
+    def open(cls, path: str | Path) -> Self:
         """Open a store: a folder ``NAME.sim``, or a file in the same schema.
 
         Raises:
             DatasetError: It does not exist, is damaged, or has another schema or version.
             MissingExtraError: h5py is not installed.
         """
+        path = Path(path)
         store = cls(path)
         if not path.exists():
             raise DatasetError(f"{path}: no such store", remedy="check the path")

@@ -36,7 +36,7 @@ that has just started may be years off."""
 
 _JUMP_S = 60.0
 _STAMP = r"-\d{8}T\d{6}\.\d{3}Z"
-_ENDING = r"(?:\.recovered)?\.mcap(?:\.part)?"
+_ENDING = r"(?:\.recovered)?\.mcap(?:\.part|\.damaged)?"
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from typing import Any
 from palpate.bus import TapSample
 from palpate.bus.topics import FIELD, FIELD_TRUTH, TARE, TOPICS, Topic, sensor_key
 from palpate.errors import ErrorCode, RecordingError, WireError
-from palpate.files.record import RecordWriter, is_being_written, recover
+from palpate.files.record import RecordWriter, Recovery, is_being_written, recover
 from palpate.health import Health
 from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
 from palpate_services.config import RecorderConfig
@@ -83,12 +83,12 @@ def leftovers(folder: Path) -> list[Path]:
     return [part for part in sorted(folder.glob(f"*.mcap{PART}")) if not _alive(part)]
 
 
-def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> list[Path]:
+def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> list[Recovery]:
     """Recover leftovers; one that cannot be read stays as it is, one that is empty is removed.
 
-    ``stop`` ends the work between two files. Returns the recovered records.
+    ``stop`` ends the work between two files. Returns what was recovered.
     """
-    done: list[Path] = []
+    done: list[Recovery] = []
     for part in parts:
         if stop is not None and stop.is_set():
             break
@@ -107,7 +107,7 @@ def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> l
 class RecordRecovery:
     """Recovers leftovers in a thread, because a large one must not delay the new record.
 
-    Counts ``recovered_records``.
+    Counts ``recovered_records``, and those of them that were damaged: ``damaged_records``.
     """
 
     def __init__(self, folder: Path, health: Health) -> None:
@@ -136,9 +136,11 @@ class RecordRecovery:
             self._thread.join(timeout=2.0)
 
     def _run(self, parts: list[Path]) -> None:
-        for path in recover_all(parts, self._stop):
-            _log.info("recovered %s", path)
+        for found in recover_all(parts, self._stop):
+            _log.log(logging.WARNING if found.places else logging.INFO, "recovered %s", found)
             self._health.count("recovered_records", 1)
+            if found.places:
+                self._health.count("damaged_records", 1)
 
 
 def _alive(part: Path) -> bool:

@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 from palpate.bus.topics import SCHEMAS, TOPICS
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
-from palpate.files.record import descriptor_set, read_record
+from palpate.files.record import descriptor_set, metadata_of, read_record
 from palpate.process import require
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.viewer.layout import (
@@ -62,7 +62,7 @@ def export_foxglove(record: Path, out: Path, *, bundles: Sequence[str] = ()) -> 
         Messages of each topic of the scene, and ``view_no_mesh``: fields whose mesh no bundle has.
 
     Raises:
-        ConfigError: ``out`` is the record, or one of ``bundles`` does not exist.
+        ConfigError: ``out`` is a record, or one of ``bundles`` does not exist.
         RecordingError: The record is truncated or not palpate's.
         DatasetError: The disk refused.
         MissingExtraError: Foxglove's messages are not installed.
@@ -70,6 +70,8 @@ def export_foxglove(record: Path, out: Path, *, bundles: Sequence[str] = ()) -> 
     require("foxglove_schemas_protobuf", extra="services")
     if out.resolve() == record.resolve():
         raise ConfigError(f"{out} is the record itself", remedy="name another file to write")
+    if out.is_file() and metadata_of(out):
+        raise ConfigError(f"{out} is another record", remedy="name another file to write")
     with written_whole(out) as part, part.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="", library="palpate")

@@ -24,7 +24,7 @@ Mixed = Annotated[Path, typer.Argument(help="Mixed data set (.h5).")]
 Bundle = Annotated[Path, typer.Argument(help="Folder of the bundle; must not exist.")]
 Version = Annotated[int, typer.Option(min=1, help="Version of the bundle.")]
 Epochs = Annotated[int, typer.Option(min=1, help="Passes over the rows at most, each network.")]
-Seed = Annotated[int, typer.Option(help="Seed of split and weights.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of split and weights.")]
 
 Serials = Annotated[
     list[str] | None,
@@ -257,7 +257,7 @@ def train_transfer(
     draws: Annotated[
         int, typer.Option(min=1, help="How often the presses are drawn; results are means.")
     ] = 12,
-    seed: Annotated[int, typer.Option(help="Of the draws.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
     twin: Annotated[
         bool, typer.Option(help="Whether a line through the twin's presses is the prior.")
     ] = True,

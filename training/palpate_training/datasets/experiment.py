@@ -371,23 +371,25 @@ def write_mixed(path: Path, data: MixedDataset) -> str:
     return write_tables(path, MIXED_SCHEMA, _mixed_columns(data), _mixed_tables(data))
 
 
-def read_experiment(path: Path) -> ExperimentDataset:
+def read_experiment(path: str | Path) -> ExperimentDataset:
     """Read a purely experimental data set and check everything about it.
 
     Raises:
         DatasetError: The file is missing, damaged, of another schema or version, was changed after
             writing, or its content breaks the schema; names the file and the dataset inside.
     """
+    path = Path(path)
     tables = read_tables(path, EXPERIMENT_SCHEMA, EXPERIMENT_COLUMNS)
     return _named(path, lambda: _experiment(tables))
 
 
-def read_mixed(path: Path) -> MixedDataset:
+def read_mixed(path: str | Path) -> MixedDataset:
     """Read a mixed data set and check everything about it.
 
     Raises:
         DatasetError: As for ``read_experiment``.
     """
+    path = Path(path)
     tables = read_tables(
         path,
         MIXED_SCHEMA,

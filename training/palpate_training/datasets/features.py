@@ -282,13 +282,14 @@ def write_dataset(path: Path, data: FeatureDataset) -> str:
     return digest
 
 
-def open_dataset(path: Path) -> FeatureDataset:
+def open_dataset(path: str | Path) -> FeatureDataset:
     """Read a data set into memory and check everything about it.
 
     Raises:
         DatasetError: The file is missing, damaged, of another schema or version, or its content
             breaks the schema; the message names the dataset inside the file.
     """
+    path = Path(path)
     with opened(path, extra="training", missing="make it: palpate data ingest-record") as file:
         FEATURES_SCHEMA.check(path, file)
         if "sensor_names" not in file.attrs:

@@ -261,7 +261,8 @@ def dataset_of(
     arrays["electrodes"] = _counts(arrays["electrodes"], source)
     if "baseline" not in arrays:
         arrays["baseline"] = _rest(arrays, columns.rest_rows, source)
-    arrays |= _groups(arrays, labelled=columns.block is not None)
+    across = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
+    arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
     left_out = rows - len(arrays["electrodes"])
     known = _provenance(table)
     return FeatureDataset(
@@ -439,12 +440,18 @@ def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
     return rest
 
 
-def _groups(arrays: Mapping[str, Any], *, labelled: bool) -> dict[str, Any]:
-    """Group and block of each row: as labelled, or pieces of each sensor's rows."""
-    labels = np.stack([arrays[name] for name in ("sensor", "group", "block")])
+def _groups(arrays: Mapping[str, Any], *, labelled: bool, across: bool) -> dict[str, Any]:
+    """Group and block of each row: as labelled, or pieces of each sensor's rows.
+
+    ``across``: A group may have rows of several sensors, which were pressed alike; to tell them
+    apart would let the same press into training and test.
+    """
+    apart = () if across else ("sensor",)
     group, block = (
-        np.unique(labels[:count], axis=1, return_inverse=True)[1].reshape(-1) for count in (2, 3)
+        np.unique([arrays[name] for name in (*apart, *names)], axis=1, return_inverse=True)[1]
+        for names in (("group",), ("group", "block"))
     )
+    group, block = group.reshape(-1), block.reshape(-1)
     if labelled or group.max() > arrays["sensor"].max():
         return {"group": group, "block": block}
     for number in np.unique(group):

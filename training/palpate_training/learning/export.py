@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from palpate import __version__
+from palpate.config import check_name
 from palpate.errors import BundleError, MissingExtraError
 from palpate.files.bundle import FieldMesh, Manifest, write_bundle
 from palpate.files.intervals import Intervals
@@ -47,12 +48,15 @@ _LARGE = 1024
 """Values of a constant from which on half the bytes are worth a cast."""
 
 
-def refuse_existing(folder: Path) -> None:
-    """Refuse to train for a bundle that cannot be written.
+def refuse_existing(folder: Path, name: str | None = None) -> None:
+    """Refuse to train for a bundle that cannot be written; ``name`` = that of the bundle.
 
     Raises:
         BundleError: The folder exists.
+        ConfigError: No bundle can have this name.
     """
+    if name is not None:
+        check_name(name, "--name")
     if folder.exists():  # refuse before minutes of training, not after
         raise BundleError(
             f"{folder} exists and bundles are immutable", remedy="write the next version"

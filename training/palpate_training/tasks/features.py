@@ -106,7 +106,7 @@ def train_features(
         DatasetError: The data set breaks its schema or has too few presses.
         BundleError: The folder exists, or parity fails; nothing is left on disk.
     """
-    refuse_existing(bundle_dir)
+    refuse_existing(bundle_dir, name)
     where = training_device(device)
     data = open_dataset(dataset_path)
     split = by_group(data.group, seed=seed)

@@ -331,7 +331,7 @@ def field_bundle(
         DatasetError: A unit is not known, or too few trajectories are left.
         BundleError: The folder exists, or parity fails; nothing is left on disk.
     """
-    refuse_existing(folder)
+    refuse_existing(folder, name)
     where = training_device(device)
     units = units or unit_sets(data.experiment)[-1]
     split = of_units(data.experiment, by_trajectory(data.experiment, seed=seed), units)

@@ -162,7 +162,7 @@ def synthesis_bundle(
     on_epoch: OnEpoch | None = None,
 ) -> dict[str, float]:
     """Field -> electrodes of one unit, as a bundle; the arguments are those of ``field_bundle``."""
-    refuse_existing(folder)
+    refuse_existing(folder, name)
     where = training_device(device)
     split = of_units(data.experiment, by_trajectory(data.experiment, seed=seed), [unit])
     with torch.device(where):
