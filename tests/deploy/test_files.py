@@ -41,6 +41,30 @@ def test_truncated_record_is_refused_and_recovered(
     shutil.move(cut, part)
     assert palpate("recover", part).returncode == 0
     assert sum(1 for _ in read_record(tmp_path / "cut.recovered.mcap")) > 100
+    again = palpate("recover", virtual_record)
+    assert again.returncode != 0
+    assert "is whole" in again.stderr
+    assert virtual_record.exists()
+
+
+@pytest.mark.parametrize("option", ["--out", "--png", "--foxglove"])
+def test_review_replaces_no_record(
+    palpate: Palpate, virtual_record: Path, tmp_path: Path, option: str
+) -> None:
+    other = tmp_path / "other.mcap"
+    shutil.copy(virtual_record, other)
+    before = other.read_bytes()
+    refused = palpate("review", virtual_record, option, other)
+    assert refused.returncode == 2
+    assert "error: " in refused.stderr
+    assert "Traceback" not in refused.stderr
+    assert other.read_bytes() == before
+
+
+def test_what_is_there_is_not_said_to_be_absent(palpate: Palpate, tmp_path: Path) -> None:
+    result = palpate("info", tmp_path)
+    assert result.returncode == 2
+    assert "is a folder" in result.stderr
 
 
 def test_review_writes_a_view(palpate: Palpate, virtual_record: Path, tmp_path: Path) -> None:

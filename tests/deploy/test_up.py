@@ -134,6 +134,11 @@ def test_a_station_answers_every_command(
     recorded = palpate("record", "--out", own, "--duration-s", "1", "--no-rrd", *where)
     assert recorded.returncode == 0, recorded.stderr
     assert "finger/electrodes" in recorded.stdout
+    nothing = palpate(
+        "record", "--out", own, "--duration-s", "1", "--no-rrd", "--sensor", "elbow", *where
+    )
+    assert nothing.returncode == 1
+    assert "nothing came of sensor 'elbow'" in nothing.stderr
     second = palpate("up", "--profile", profile)
     assert second.returncode == 1
     assert "is in use" in second.stderr

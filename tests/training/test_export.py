@@ -12,7 +12,7 @@ import onnxruntime
 import pytest
 import torch
 
-from palpate.errors import BundleError, DatasetError
+from palpate.errors import BundleError, ConfigError, DatasetError
 from palpate.files.bundle import read_bundle
 from palpate_training.datasets.features import FeatureDataset, write_dataset
 from palpate_training.learning import export
@@ -189,6 +189,12 @@ def test_train_features(press_data: MakeData, tmp_path: Path) -> None:
     assert (np.array(location.high) <= high + 1e-6).all()
     with pytest.raises(BundleError, match="immutable"):
         train_features(tmp_path / "presses.h5", tmp_path / "bundle", config=QUICK)
+
+
+def test_a_name_that_no_bundle_can_have_is_refused_before_training(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--name"):
+        train_features(tmp_path / "not-read.h5", tmp_path / "bundle", name="a b/../c")
+    assert not list(tmp_path.iterdir())
 
 
 def test_too_few_presses_are_named(press_data: MakeData, tmp_path: Path) -> None:

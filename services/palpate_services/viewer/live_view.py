@@ -249,7 +249,8 @@ class _ViewLost(Exception):
 
 def draw_view(descriptor: int) -> None:
     """Draw one view: the whole life of the child; ``descriptor`` is that of its socket."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # of the group; the recorder says when it ends
+    # What comes to the whole group: the recorder says when it ends.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(OSError):  # a strict unit forbids it
         os.nice(_NICENESS)
