@@ -152,6 +152,7 @@ def test_a_study_of_paths_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) ->
     assert done.exit_code == 0
     assert json.loads(done.stdout)["rows"][0]["words"] == "press 1 mm, unload"
     assert fem("study", "paths", "--png", "a.png").exit_code == 2
+    assert fem("study", "mesh", "--fill-ml", "nan").exit_code == 2
 
 
 def test_the_bench_tells_times_and_rates_of_the_solver() -> None:

@@ -197,6 +197,16 @@ def test_a_name_that_no_bundle_can_have_is_refused_before_training(tmp_path: Pat
     assert not list(tmp_path.iterdir())
 
 
+def test_one_tested_press_tells_nothing_of_how_sure_its_error_is(
+    press_data: MakeData, tmp_path: Path
+) -> None:
+    write_dataset(tmp_path / "presses.h5", press_data(presses=3))
+    train_features(tmp_path / "presses.h5", tmp_path / "bundle", config=QUICK)
+    metrics = read_bundle(tmp_path / "bundle").manifest.metrics
+    assert "force_magnitude_median_n" in metrics
+    assert not [name for name in metrics if "ci95" in name]
+
+
 def test_too_few_presses_are_named(press_data: MakeData, tmp_path: Path) -> None:
     write_dataset(tmp_path / "two.h5", press_data(presses=2))
     with pytest.raises(DatasetError, match="2 groups"):

@@ -320,6 +320,7 @@ def bench(
     epilog=_example("palpate fem study mesh --png mesh.png", "palpate fem study paths --json")
 )
 def study(
+    context: typer.Context,
     what: Annotated[
         StudyKind, typer.Argument(metavar="mesh|steps|paths", help="What to refine, or paths.")
     ],
@@ -339,6 +340,9 @@ def study(
     """
     from palpate_fem.cli.check import path_study_command, study_command
 
+    of_paths = {"count", "seed", "edge_mm", "fill_ml"} & _given(context)
+    if what is not StudyKind.PATHS and of_paths:
+        raise typer.BadParameter(f"--{min(of_paths).replace('_', '-')} is for paths only")
     if what is StudyKind.PATHS:
         if png is not None:
             raise typer.BadParameter("--png draws mesh and steps only")

@@ -177,5 +177,5 @@ def check_limits(**arguments: float) -> None:
         if not low <= value <= high:
             raise ConfigError(
                 f"{name} = {value} is not within [{low:g}, {high:g}]",
-                remedy="give lengths in metres, within these limits",
+                remedy="stay within these limits; lengths are in metres here, in mm as options",
             )

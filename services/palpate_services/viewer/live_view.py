@@ -252,6 +252,9 @@ def draw_view(descriptor: int) -> None:
     # What comes to the whole group: the recorder says when it ends.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
+    # Rerun's warning that a view has no footer, as is meant, would stand between the lines of a
+    # command.
+    os.environ.setdefault("RUST_LOG", "error")
     with contextlib.suppress(OSError):  # a strict unit forbids it
         os.nice(_NICENESS)
     use_few_resources()

@@ -99,6 +99,7 @@ def test_features_of_both_kinds_of_file_and_of_one_specimen(of_features: Path) -
     folder = of_features
     found = evaluate(folder / "bundle", [folder / "features.h5"])
     assert found.trained_on
+    assert evaluate(folder / "bundle", [folder / "mixed.h5"]).trained_on
     mixed = evaluate(folder / "bundle", [folder / "mixed.h5"])
     assert [one.value for one in found.figures] == pytest.approx(
         [one.value for one in mixed.figures], nan_ok=True

@@ -207,10 +207,12 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
             remedy="say which with --unit; its model card does",
         )
     about: list[tuple[str, str]] = []
+    digests: set[str] = set()
     parts: list[_Errors] = []
     for path in paths:
         if manifest.task == "features":
             data, provenance, digest = read_features(path)
+            digests.add(data.content_sha256())  # of a mixed file, whose features were learned from
             parts.append(_of_features(bundle, data, _rows_of_sensor(data, unit, path)))
         else:
             mixed = read_mixed(path)
@@ -221,6 +223,7 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
             of = _of_field if manifest.task == "field" else _of_synthesis
             parts.append(of(bundle, mixed, rows))
         about.append((provenance.source, digest))
+        digests.add(digest)
     errors = _joined(parts)
     return BundleErrors(
         bundle=f"{manifest.name} {manifest.version}",
@@ -230,7 +233,7 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
         rows=len(errors.press),
         presses=len(np.unique(errors.press)),
         figures=tuple(_figures(errors)),
-        trained_on=manifest.training_data_sha256 in {digest for _, digest in about},
+        trained_on=manifest.training_data_sha256 in digests,
     )
 
 

@@ -318,7 +318,8 @@ def _force_report(
             metrics[f"{model}_{key}"] = baseline[key]
     errors = force_errors(estimate[touching], truth[touching])
     wanted = {key: errors[key] for key in ("magnitude_n", "angle_rad")}
-    ends = cluster_bootstrap(wanted, data.group[split.test][touching])
+    presses = data.group[split.test][touching]
+    ends = cluster_bootstrap(wanted, presses) if _several(presses) else {}
     for key, (low, high) in ends.items():
         quantity, unit = key.split("_")
         metrics[f"force_{quantity}_median_ci95_low_{unit}"] = low
@@ -369,7 +370,13 @@ def _contact_report(
             else location_errors(other, truth)["distance_m"]
         )
         metrics[f"{model}_{headline}"] = float(np.median(others))
-    ends = cluster_bootstrap({"error": errors}, group[test_on])
-    stem, _, unit = headline.rpartition("_")
-    metrics[f"{stem}_ci95_low_{unit}"], metrics[f"{stem}_ci95_high_{unit}"] = ends["error"]
+    if _several(group[test_on]):
+        ends = cluster_bootstrap({"error": errors}, group[test_on])
+        stem, _, unit = headline.rpartition("_")
+        metrics[f"{stem}_ci95_low_{unit}"], metrics[f"{stem}_ci95_high_{unit}"] = ends["error"]
     return metrics
+
+
+def _several(press: npt.NDArray[np.integer]) -> bool:
+    """Whether there is more than one press, without which nothing tells how sure an error is."""
+    return len(np.unique(press)) > 1

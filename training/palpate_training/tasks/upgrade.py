@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.errors import BundleError, DatasetError
+from palpate.errors import BundleError, ConfigError, DatasetError
 from palpate.files.bundle import Bundle, read_bundle, write_bundle
 from palpate.files.tasks import tensors_of
 from palpate.files.training_range import KnownInputs
@@ -42,11 +42,16 @@ def upgrade_bundle(old: Path, data: Path, out: Path, *, units: Sequence[str] = (
     Raises:
         BundleError: It breaks its contract, ``out`` exists, or the rows are of another fingertip.
         DatasetError: The data set breaks its schema.
+        ConfigError: Specimens are named for a bundle of features.
     """
     refuse_existing(out)
     bundle = read_bundle(old)
     known: KnownInputs | None = None
     if bundle.manifest.task == "features":
+        if units:
+            raise ConfigError(
+                "--units is for mixed data sets; features take all rows", remedy="leave it out"
+            )
         presses = open_dataset(data)
         found = features_range(presses, np.arange(len(presses)))
         known = known_inputs(presses.tared_counts, presses.group)
