@@ -56,6 +56,18 @@ def test_recovery_of_a_bad_part_ends_within_bounds(name: str, tmp_path: Path) ->
         assert part.exists()  # what cannot be read is never removed
 
 
+def test_recovery_passes_many_heads_of_chunks_that_are_not_there(tmp_path: Path) -> None:
+    """Each says that nearly the whole file is its chunk; to believe them would take hours."""
+    part = tmp_path / "bad.mcap.part"
+    write_good(tmp_path / "bad.mcap")
+    head = b"\x06" + (20 << 20).to_bytes(8, "little") + bytes(28) + b"\x04\x00\x00\x00zstd"
+    part.write_bytes((tmp_path / "bad.mcap").read_bytes()[:-30] + 400_000 * head)
+    (tmp_path / "bad.mcap").unlink()
+    found = recover(part)
+    assert summarise(found.path).counts == {KEY: 100}
+    assert found.places > 1
+
+
 def test_the_writer_takes_no_more_streams_than_the_reader(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -316,8 +316,8 @@ def _follow(
         exit_status = children.status("gateway")
         statuses = {status.service: status for status in ask_status(session)}
         counters = {service: dict(status.counters) for service, status in statuses.items()}
-        for status in (*_waiting(told), *filter(None, (statuses.get("gateway"),))):
-            if not account.counted:
+        for status in (*_waiting(told), *statuses.values()):
+            if status.service == "gateway" and not account.counted:
                 account.gateway = dict(status.counters)
                 account.counted = status.state is ServiceState.FINISHED
         account.features = counters.get("features", account.features)

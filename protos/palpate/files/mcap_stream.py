@@ -57,7 +57,8 @@ _TIME_MAX_NS = 2**63  # the year 2262; later ones do not fit the arrays of times
 _END_BYTES = _HEAD.size + 20 + len(_MAGIC)  # footer and magic
 _PASSED_OVER_MAX = CHUNK_BYTES_MAX  # of one record, where a file is known to be damaged [bytes]
 _PACKED_CHUNK = re.compile(rb"\x06.{36}(?:\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4)", re.DOTALL)
-_LOOK_BYTES = 1 << 20
+_LOOK_FIRST, _LOOK_BYTES = 1 << 12, 1 << 20
+_LOOK_MAX = 1 << 30  # how far the next chunk behind a damage is looked for [bytes]
 
 DAMAGED = (
     McapError,
@@ -219,7 +220,9 @@ def _records(
     while True:
         at = file.tell()
         try:
-            found = _record(file, at, file_bytes if on_damage is None else _PASSED_OVER_MAX)
+            found = _record(
+                file, file_bytes - at, file_bytes if on_damage is None else _PASSED_OVER_MAX
+            )
         except (ValueError, EOFError) as error:
             if on_damage is None:
                 raise
@@ -235,8 +238,9 @@ def _records(
             yield *found, at
 
 
-def _record(file: IO[bytes], at: int, passed_over_max: int) -> tuple[int, bytes] | None:
-    """Opcode and content of the next record; None = a kind that is passed over."""
+def _record(file: IO[bytes], left: int, passed_over_max: int) -> tuple[int, bytes] | None:
+    """Opcode and content of the next record, ``left`` bytes before the end; None = passed over."""
+    at = file.tell()
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         raise EOFError("the end is missing")
@@ -254,7 +258,8 @@ def _record(file: IO[bytes], at: int, passed_over_max: int) -> tuple[int, bytes]
         raise ValueError(
             f"the record at byte {at:,} says that it has {size:,} bytes, {most:,} are allowed"
         )
-    data = file.read(size)
+    # Else thousands of heads that say so would each have the rest of the file read.
+    data = file.read(size) if size <= left else b""
     if len(data) < size:
         raise EOFError("the end is missing")
     return opcode, data
@@ -262,10 +267,10 @@ def _record(file: IO[bytes], at: int, passed_over_max: int) -> tuple[int, bytes]
 
 def _next_chunk(file: IO[bytes], start: int) -> int | None:
     """Where the next packed chunk begins by its looks; whether it is one, its checksum tells."""
-    kept, at = b"", start
+    kept, at, step = b"", start, _LOOK_FIRST
     file.seek(start)
-    while block := file.read(_LOOK_BYTES):
-        data = kept + block
+    while at - start < _LOOK_MAX and (block := file.read(step)):
+        data, step = kept + block, min(2 * step, _LOOK_BYTES)
         for found in _PACKED_CHUNK.finditer(data):
             _, size = _HEAD.unpack_from(data, found.start())
             if size <= CHUNK_BYTES_MAX:

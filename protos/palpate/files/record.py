@@ -605,8 +605,9 @@ def recover(part: Path) -> Recovery:
         part.unlink()
         original = None
     elif unfinished:
-        original = part.with_name(part.name.removesuffix(".part") + DAMAGED_ENDING)
-        os.replace(part, original)
+        aside = part.with_name(part.name.removesuffix(".part") + DAMAGED_ENDING)
+        if not aside.exists():
+            original = part.rename(aside)
     return Recovery(target, original, places, left_out, damages[0] if damages else None)
 
 
