@@ -74,20 +74,34 @@ class RayCluster(Closing):
             _check_reachable(address)
         on_term = signal.getsignal(signal.SIGTERM)
         try:
+            try:
+                self._join(address)
+            except LinkError:
+                if address != "local":
+                    raise
+                self.ray.shutdown()  # a busy host is slower than Ray waits, which nothing changes
+                self._join(address)
+        finally:  # Ray sets a handler of its own, which would end the command at once
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGTERM, on_term)
+
+    def _join(self, address: str) -> None:
+        try:
             self.ray.init(
                 address=None if address == "local" else address,
                 include_dashboard=False,
                 log_to_driver=False,
                 logging_level="ERROR",
             )
-        except (ConnectionError, ValueError, RuntimeError) as error:
+        except Exception as error:
+            # A bare Exception says that a new node did not start in time.
+            known = ConnectionError, ValueError, RuntimeError
+            if not isinstance(error, known) and type(error) is not Exception:
+                raise
             raise LinkError(
                 f"no Ray cluster answers at {address!r}: {str(error).splitlines()[0]}",
                 remedy="start one (ray start --head), or leave --ray out",
             ) from error
-        finally:  # Ray sets a handler of its own, which would end the command at once
-            if threading.current_thread() is threading.main_thread():
-                signal.signal(signal.SIGTERM, on_term)
 
     def count(self, resource: str) -> int:
         """How many of a resource its machines have now, free or not: ``CPU`` or ``GPU``."""

@@ -12,6 +12,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -573,3 +574,24 @@ def test_sample_is_small_and_playable_and_the_rest_lacks_it(
     np.testing.assert_allclose(press.counts[0, 0], tape.specimens[0].rest_counts)
     assert np.linalg.norm(press.force[-1]) > np.linalg.norm(press.force[1])
     assert sum((tmp_path / name).stat().st_size for name in ("s.h5", "t.npz")) < 3e6
+
+
+@pytest.mark.parametrize("slow_starts", [1, 2])
+def test_a_new_cluster_may_be_slow_to_start_once(
+    slow_starts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def init(**options: object) -> None:
+        calls.append("init")
+        if calls.count("init") <= slow_starts:
+            raise Exception("The current node timed out during startup.")  # as Ray says it
+
+    ray = SimpleNamespace(init=init, shutdown=lambda: calls.append("shutdown"))
+    monkeypatch.setattr("palpate.cluster.require", lambda module, extra: ray)
+    if slow_starts > 1:
+        with pytest.raises(LinkError, match="timed out during startup"):
+            RayCluster("local")
+    else:
+        RayCluster("local")
+    assert calls == ["init", "shutdown", "init"]
