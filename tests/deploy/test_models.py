@@ -101,6 +101,8 @@ def test_import_load_and_roll_back(
     assert told("load", "mine") == [("mine", 7, "")]
     served = [("mine", 7, ""), (bundle, shipped, "thumb")]
     assert told("load", bundle, "--sensor", "thumb") == served
+    again = palpate("model", "load", bundle, "--sensor", "thumb", "--profile", profile)
+    assert "no gateway has sensor 'thumb'" in again.stderr, "it may come, or be misspelt"
     features.send_signal(signal.SIGKILL)
     features.wait()
     run("features")

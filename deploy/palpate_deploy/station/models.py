@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate.admin import read_token, token_file
-from palpate.bus import Session
+from palpate.bus import Session, endpoints
 from palpate.client.models import ModelAdmin
 from palpate.config import LinkConfig
 from palpate.errors import LinkError, PalpateError, printable
@@ -180,7 +181,14 @@ def change_model(
                 found = {name: admin.unload(name, sensor=sensor)}
             else:
                 found = {name: admin.roll_back(name, sensor=sensor)}
+        loaded_for = sensor if action is ModelAction.LOAD else ""
+        absent = bool(loaded_for) and not session.serves(endpoints.TARE, sensor=loaded_for)
     _show(found, as_json=as_json)
+    if absent:  # it may come later; but a name may be misspelt, too
+        sys.stderr.write(
+            f"note: no gateway has sensor {sensor!r} at present; it will have this bundle when one "
+            "does\n"
+        )
 
 
 def _service_of(bundle: str, kept: ModelsConfig) -> str:
