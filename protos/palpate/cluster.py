@@ -74,13 +74,12 @@ class RayCluster(Closing):
             _check_reachable(address)
         on_term = signal.getsignal(signal.SIGTERM)
         try:
-            try:
-                self._join(address)
-            except LinkError:
-                if address != "local":
-                    raise
-                self.ray.shutdown()  # a busy host is slower than Ray waits, which nothing changes
-                self._join(address)
+            self._join(address)
+        except LinkError:
+            if address != "local":
+                raise
+            self.ray.shutdown()  # a busy host is slower than Ray waits, which nothing changes
+            self._join(address)
         finally:  # Ray sets a handler of its own, which would end the command at once
             if threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGTERM, on_term)

@@ -10,9 +10,11 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -168,12 +170,16 @@ def test_a_cluster_gives_the_same_rows(generated: GeneratedExperiment, tmp_path:
     np.testing.assert_allclose(there.force, here.force[same], atol=1e-3)
 
 
-def test_devices_fill_the_same_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mechanics by processes of devices, on a finger that solves a formula."""
+@pytest.fixture
+def simulate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., list[tuple[int, int]]]:
+    """The mechanics by devices, on a finger that solves a formula; tells how far it was when."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "fem"))
     monkeypatch.setattr("palpate_deploy.experiment.DEFAULT_FACTORY", "fem_fakes:round_finger")
-    told: list[tuple[int, int]] = []
-    for devices, slots in (("cpu", "cpu"), 2), (("cpu",), None):
+
+    def run_devices(devices: tuple[str, ...], slots: int | None, **more: Any) -> list[Any]:
+        told: list[tuple[int, int]] = []
         assert FemSimulator().simulate(
             SPEC,
             tmp_path / STORE,
@@ -183,54 +189,35 @@ def test_devices_fill_the_same_store(tmp_path: Path, monkeypatch: pytest.MonkeyP
             on_progress=lambda done, total, _: told.append((done, total)),
             devices=devices,
             slots=slots,
+            **more,
         )
+        return told
+
+    return run_devices
+
+
+def test_devices_fill_the_same_store(simulate: Callable[..., Any], tmp_path: Path) -> None:
+    """By processes of devices."""
+    told = simulate(("cpu", "cpu"), 2) + simulate(("cpu",), None)
     assert told == [(1, 2), (2, 2)], "the second finds all there"
     assert len(SimulationStore.open(tmp_path / STORE).done()) == 2
 
 
 def test_devices_of_a_cluster_fill_the_same_store(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    simulate: Callable[..., Any], tmp_path: Path
 ) -> None:
     pytest.importorskip("ray", reason="needs palpate[cluster]")
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "fem"))
-    monkeypatch.setattr("palpate_deploy.experiment.DEFAULT_FACTORY", "fem_fakes:round_finger")
-    told: list[tuple[int, int]] = []
     with RayCluster("local") as cluster:
-        assert FemSimulator().simulate(
-            SPEC,
-            tmp_path / STORE,
-            workers=1,
-            threads=1,
-            stop=threading.Event(),
-            on_progress=lambda done, total, _: told.append((done, total)),
-            devices=("cpu",),
-            slots=2,
-            cluster=cluster,
-        )
+        told = simulate(("cpu",), 2, cluster=cluster)
     assert told == [(1, 2), (2, 2)]
     assert len(SimulationStore.open(tmp_path / STORE).done()) == 2
 
 
 def test_what_another_process_has_claimed_is_not_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    simulate: Callable[..., Any], tmp_path: Path
 ) -> None:
     """Else a data set of a part would look whole."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "fem"))
-    monkeypatch.setattr("palpate_deploy.experiment.DEFAULT_FACTORY", "fem_fakes:round_finger")
-
-    def simulate() -> bool:
-        return FemSimulator().simulate(
-            SPEC,
-            tmp_path / STORE,
-            workers=1,
-            threads=1,
-            stop=threading.Event(),
-            on_progress=lambda done, total, word: None,
-            devices=("cpu",),
-            slots=2,
-        )
-
-    assert simulate()
+    simulate(("cpu",), 2)
     store = SimulationStore.open(tmp_path / STORE)
     name = min(store.done())
     fingertip = store.fingertip()
@@ -238,8 +225,8 @@ def test_what_another_process_has_claimed_is_not_left_out(
     file.unlink()
     other = StoreWriter(tmp_path / STORE, fingertip, shared=True)
     with other, other.claim(name), pytest.raises(DatasetError, match=r"1 of 2 .* claimed"):
-        simulate()
-    assert simulate()  # the claim is gone
+        simulate(("cpu",), 2)
+    simulate(("cpu",), 2)  # the claim is gone
 
 
 @pytest.mark.parametrize(

@@ -195,6 +195,25 @@ def test_what_lies_behind_a_damage_is_recovered_and_nothing_is_deleted(
     assert kept.read_bytes() == content
 
 
+def test_a_stream_is_saved_whose_schema_stood_in_a_damaged_chunk(
+    tmp_path: Path, payload: bytes
+) -> None:
+    path = tmp_path / "run.mcap"
+    thumb = sensor_key("lab", "thumb", "electrodes")
+    with RecordWriter(path) as writer:
+        for key in (KEY, thumb):  # of one schema, written with the first
+            writer.write(key, ELECTRODE_FRAME.schema, payload, log_time_ns=1000)
+            writer.flush()
+    whole = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    first = summary.chunk_indexes[0].chunk_start_offset
+    whole[first + 80 : first + 83] = bytes(3)
+    path.write_bytes(whole)
+    assert summarise(recover(path).path).counts == {thumb: 1}
+
+
 def test_recovery_replaces_no_other_file_and_leaves_whole_records(
     long_record: Path, tmp_path: Path
 ) -> None:

@@ -305,4 +305,4 @@ def recover_record(part: Path) -> None:
     """
     found = recover(part)
     print_contents(found.path)
-    print(found)
+    print(printable(str(found)))

@@ -181,8 +181,8 @@ def change_model(
                 found = {name: admin.unload(name, sensor=sensor)}
             else:
                 found = {name: admin.roll_back(name, sensor=sensor)}
-        loaded_for = sensor if action is ModelAction.LOAD else ""
-        absent = bool(loaded_for) and not session.serves(endpoints.TARE, sensor=loaded_for)
+        named = action is ModelAction.LOAD and sensor != ""
+        absent = named and not session.serves(endpoints.TARE, sensor=sensor)
     _show(found, as_json=as_json)
     if absent:  # it may come later; but a name may be misspelt, too
         sys.stderr.write(

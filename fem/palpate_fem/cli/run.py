@@ -122,10 +122,10 @@ class RunOptions:
         for name in self.indenters:
             make_indenter(name)
         ways = {"--sweep": self.sweep, "--path": self.path, "--poses": self.poses}
-        given = [name for name, value in ways.items() if value]
-        if len(given) > 1:
-            raise ConfigError(f"{' and '.join(given)} exclude each other", remedy="give one")
-        way = given[0] if given else _PRESS
+        chosen = [name for name, value in ways.items() if value]
+        if len(chosen) > 1:
+            raise ConfigError(f"{' and '.join(chosen)} exclude each other", remedy="give one")
+        way = chosen[0] if chosen else _PRESS
         for name, belongs_to in _OF_WAYS.items():
             if name in self.given and way not in belongs_to:
                 raise ConfigError(

@@ -178,8 +178,7 @@ class ContactSurface:
         for kept, now in zip(self._frozen, self._freezing, strict=True):
             wp.copy(kept, now)
         unsymmetric = self.unsymmetric.numpy().reshape(self.count, 9 * self.points)
-        sliding = np.flatnonzero(np.any(unsymmetric != 0.0, axis=1)).astype(np.int32)
-        self._sliding = wp.array(sliding, dtype=wp.int32, device=DEVICE)
+        self._sliding = _numbers(np.any(unsymmetric != 0.0, axis=1))
 
     def keep(self, correction: MortarCorrection, pressure: Floats) -> None:
         """Keep the mortar correction and the pressures [Pa], (F, Q), of an evaluation."""
@@ -269,8 +268,8 @@ class ContactSurface:
         """Faces of which a node may touch, or touched at the last evaluation.
 
         Args:
-            bound: Gaps of the surface's nodes [m], or less, but above the margin, where they are
-                above it. Those of all other faces are set.
+            bound: Gaps of the surface's nodes [m]; above the margin any value above it. The gaps of
+                all faces are set to these.
             margin_m: Gap from which on a node cannot touch [m].
         """
         gap = np.empty(self.nodes)

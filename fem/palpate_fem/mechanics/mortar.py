@@ -44,7 +44,7 @@ would cycle. Where there is no valley, holding would only make corrections conve
 Distance = Callable[[Floats, float], tuple[Floats, Floats]]
 """Gaps [m], (N,), and their gradients, (N, 3), at points [m], (N, 3).
 
-Above a margin [m], the second argument, the gap may be any value above it, and the gradient too.
+The second argument is a margin [m]: a gap above it may be any value above it, of any gradient.
 """
 
 

@@ -130,15 +130,22 @@ def parts_of(file: IO[bytes], on_damage: OnDamage | None = None) -> Iterator[Par
 def _parts(opcode: int, data: bytes, at: int, budget: _Budget) -> Iterator[Part]:
     if opcode == Opcode.CHUNK:
         yield from _of_chunk(_chunk(data, at), at, budget)
-    elif opcode == Opcode.MESSAGE:
-        budget.spend(_MESSAGE_COST, at)
-        yield _message(data, at)
-    elif opcode == Opcode.SCHEMA:
-        yield budget.schema(data, at)
-    elif opcode == Opcode.CHANNEL:
-        yield budget.channel(data, at)
     elif opcode == Opcode.METADATA:
         yield Metadata.read(ReadDataStream(BytesIO(data)))
+    elif (part := _part(opcode, data, at, budget)) is not None:
+        yield part
+
+
+def _part(opcode: int, data: bytes, at: int, budget: _Budget) -> Part | None:
+    """A record of a kind that stands in chunks, too; None = of another kind."""
+    if opcode == Opcode.MESSAGE:
+        budget.spend(_MESSAGE_COST, at)
+        return _message(data, at)
+    if opcode == Opcode.SCHEMA:
+        return budget.schema(data, at)
+    if opcode == Opcode.CHANNEL:
+        return budget.channel(data, at)
+    return None
 
 
 def check_summary(file: IO[bytes]) -> None:
@@ -303,15 +310,10 @@ def _of_chunk(chunk: Chunk, at: int, budget: _Budget) -> Iterator[Part]:
             raise ValueError(f"a record in the chunk at byte {at:,} is longer than the chunk")
         content = data[place : place + size]
         place += size
-        if opcode == Opcode.MESSAGE:
-            budget.spend(_MESSAGE_COST, at)
-            yield _message(content, at)
-        elif opcode == Opcode.SCHEMA:
-            yield budget.schema(content, at)
-        elif opcode == Opcode.CHANNEL:
-            yield budget.channel(content, at)
-        else:
+        part = _part(opcode, content, at, budget)
+        if part is None:
             raise ValueError(f"the chunk at byte {at:,} holds a record of kind {opcode}")
+        yield part
 
 
 def _message(content: bytes, at: int) -> McapMessage:

@@ -35,6 +35,7 @@ from palpate.files.mcap_stream import (
     Damage,
     McapMessage,
     OnDamage,
+    Part,
     check_summary,
     parts_of,
 )
@@ -312,37 +313,35 @@ def read_record(
     Raises:
         RecordingError: Not a record of palpate, or damaged (after the messages before the damage).
     """
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, tuple[str, StreamAddress, str]] = {}
+    streams = _Streams(path, allow_partial=allow_partial)
     count = 0
     complete = searched = False
     tell = on_damage or _ignore
     try:
         with open_regular(path) as stream:
             for part in parts_of(stream, tell if allow_partial else None):
-                if isinstance(part, McapMessage):
-                    if allow_partial and part.channel_id not in channels:
-                        # Its chunk is damaged, but a whole file says it once more at its end.
-                        if not searched:
-                            searched, channels = True, _all_channels(path) | channels
-                        if part.channel_id not in channels:
-                            tell(Damage(0, len(part.data), "a message of a stream without name"))
-                            continue
-                    key, address, schema = channels[part.channel_id]
-                    count += 1
-                    yield RecordItem(
-                        key,
-                        address,
-                        schema,
-                        part.data,
-                        part.log_time_ns,
-                        part.publish_time_ns,
-                        part.sequence,
-                    )
-                elif isinstance(part, Schema):
-                    schemas[part.id] = part
-                elif isinstance(part, Channel) and part.id not in channels:
-                    channels[part.id] = _channel(path, part, schemas)
+                if not isinstance(part, McapMessage):
+                    streams.learn(part)
+                    continue
+                if allow_partial and part.channel_id not in streams.known:
+                    # Its chunk is damaged, but a whole file says it once more at its end.
+                    if not searched:
+                        searched = True
+                        streams.learn_all()
+                    if part.channel_id not in streams.known:
+                        tell(Damage(0, len(part.data), "a message of a stream without name"))
+                        continue
+                key, address, schema = streams.known[part.channel_id]
+                count += 1
+                yield RecordItem(
+                    key,
+                    address,
+                    schema,
+                    part.data,
+                    part.log_time_ns,
+                    part.publish_time_ns,
+                    part.sequence,
+                )
         complete = True
     except FileNotFoundError as error:
         raise RecordingError(f"{path} does not exist", remedy="check the path") from error
@@ -356,13 +355,13 @@ def read_record(
     except DAMAGED as error:
         if isinstance(error, RecordingError):
             raise
-        if not (allow_partial and channels and isinstance(error, EOFError)):
+        if not (allow_partial and streams.known and isinstance(error, EOFError)):
             raise RecordingError(
                 f"{path} is damaged or cut off after {count} messages: "
                 f"{printable(str(error)) or type(error).__name__}",
                 remedy="recover the whole messages with `palpate recover`",
             ) from error
-    if complete and not channels and not allow_partial:
+    if complete and not streams.known and not allow_partial:
         raise RecordingError(
             f"{path} holds no palpate messages", remedy="give a record written by palpate"
         )
@@ -372,36 +371,48 @@ def _ignore(damage: Damage) -> None:
     """What is left out is of no interest."""
 
 
-def _all_channels(path: Path) -> dict[int, tuple[str, StreamAddress, str]]:
-    """Streams by their number, wherever in a damaged file they are named."""
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, tuple[str, StreamAddress, str]] = {}
-    with open_regular(path) as stream, contextlib.suppress(EOFError):
-        for part in parts_of(stream, _ignore):
-            if isinstance(part, Schema):
-                schemas[part.id] = part
-            elif (
-                isinstance(part, Channel) and part.id not in channels and part.schema_id in schemas
-            ):
-                channels[part.id] = _channel(path, part, schemas)
-    return channels
+class _Streams:
+    """Streams of a file, as its schemas and channels name them.
 
+    Attributes:
+        known: Key, its parts, and the message's full name, by the number of the channel.
+    """
 
-def _channel(
-    path: Path, channel: Channel, schemas: dict[int, Schema]
-) -> tuple[str, StreamAddress, str]:
-    schema = schemas.get(channel.schema_id)
-    if schema is None or schema.encoding != "protobuf":
-        raise RecordingError(
-            f"{path}: channel {channel.topic!r} has no protobuf schema",
-            remedy="give a record written by palpate",
-        )
-    if schema.name not in SCHEMAS:
-        raise RecordingError(
-            f"{path}: schema {schema.name!r} is not of contract v{CONTRACT_VERSION}",
-            remedy="read it with the palpate that wrote it, or upgrade palpate",
-        )
-    return channel.topic, parse_key(channel.topic), schema.name
+    def __init__(self, path: Path, *, allow_partial: bool) -> None:
+        self._path, self._allow_partial = path, allow_partial
+        self._schemas: dict[int, Schema] = {}
+        self.known: dict[int, tuple[str, StreamAddress, str]] = {}
+
+    def learn(self, part: Part) -> None:
+        """Take up a schema or a channel; metadata and messages say nothing.
+
+        Raises:
+            RecordingError: The channel is not of palpate, or of a contract that is not known.
+            WireError: Its key is not of this contract.
+        """
+        if isinstance(part, Schema):
+            self._schemas[part.id] = part
+        elif isinstance(part, Channel) and part.id not in self.known:
+            schema = self._schemas.get(part.schema_id)
+            if schema is None and self._allow_partial:
+                return  # its chunk may be damaged; the end of a whole file names both once more
+            if schema is None or schema.encoding != "protobuf":
+                raise RecordingError(
+                    f"{self._path}: channel {part.topic!r} has no protobuf schema",
+                    remedy="give a record written by palpate",
+                )
+            if schema.name not in SCHEMAS:
+                raise RecordingError(
+                    f"{self._path}: schema {schema.name!r} is not of contract v{CONTRACT_VERSION}",
+                    remedy="read it with the palpate that wrote it, or upgrade palpate",
+                )
+            self.known[part.id] = part.topic, parse_key(part.topic), schema.name
+
+    def learn_all(self) -> None:
+        """Take up those of the whole file, wherever they are named."""
+        with open_regular(self._path) as stream, contextlib.suppress(EOFError):
+            for part in parts_of(stream, _ignore):
+                self.learn(part)
 
 
 def only_name(path: Path, topic: str, what: str) -> str:
@@ -571,14 +582,13 @@ def recover(part: Path) -> Recovery:
         raise RecordingError(
             f"{target} exists and would be replaced", remedy="move it away and recover again"
         )
-    damages: list[Damage] = []
+    first_damage: Damage | None = None
     places = left_out = 0
 
     def on_damage(damage: Damage) -> None:
-        nonlocal places, left_out
+        nonlocal first_damage, places, left_out
         places, left_out = places + 1, left_out + damage.size
-        if not damages:
-            damages.append(damage)
+        first_damage = first_damage or damage
 
     facts = {**metadata_of(part), "recovered_from": part.name}
     items = read_record(part, allow_partial=True, on_damage=on_damage)
@@ -601,21 +611,20 @@ def recover(part: Path) -> Recovery:
                 sequence=item.sequence,
             )
     original: Path | None = part
-    if unfinished and not damages:
+    if unfinished and not places:
         part.unlink()
         original = None
     elif unfinished:
         aside = part.with_name(part.name.removesuffix(".part") + DAMAGED_ENDING)
         if not aside.exists():
             original = part.rename(aside)
-    return Recovery(target, original, places, left_out, damages[0] if damages else None)
+    return Recovery(target, original, places, left_out, first_damage)
 
 
 def _is_whole(path: Path) -> bool:
     """Whether a finished record can be read to its end, and its index is sound."""
     try:
-        for _ in read_record(path):
-            pass
+        summarise(path)
         check_readable(path)
     except RecordingError:
         return False

@@ -448,10 +448,11 @@ def _groups(arrays: Mapping[str, Any], *, labelled: bool, across: bool) -> dict[
     """
     apart = () if across else ("sensor",)
     group, block = (
-        np.unique([arrays[name] for name in (*apart, *names)], axis=1, return_inverse=True)[1]
+        np.unique([arrays[name] for name in (*apart, *names)], axis=1, return_inverse=True)[
+            1
+        ].reshape(-1)
         for names in (("group",), ("group", "block"))
     )
-    group, block = group.reshape(-1), block.reshape(-1)
     if labelled or group.max() > arrays["sensor"].max():
         return {"group": group, "block": block}
     for number in np.unique(group):
