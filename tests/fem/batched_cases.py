@@ -12,7 +12,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from palpate_fem.batched.equations import BatchedEquations
-from palpate_fem.batched.state import BatchedState, Listed, SlotNumbers
+from palpate_fem.batched.launches import Listed
+from palpate_fem.batched.state import BatchedState, SlotNumbers
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.contact import PosedIndenter
 from palpate_fem.mechanics.iteration import NewtonSettings, Step

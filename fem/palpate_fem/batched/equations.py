@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from palpate_fem.arrays import Floats, Ints
 from palpate_fem.batched import kernels, mortar_kernels, point_kernels, reductions
-from palpate_fem.batched.launches import Launches, Sequences
+from palpate_fem.batched.launches import Launches, Listed, Sequences
 from palpate_fem.batched.state import (
     BatchedState,
-    Listed,
     SlotNumbers,
     flat,
     on_device,
@@ -143,26 +142,9 @@ class BatchedEquations:
         if key not in self._lists:
             if len(self._lists) == KEPT_LISTS:
                 self._lists.pop(next(iter(self._lists)))
-            self._lists[key] = self._make_list(np.array(numbers))
+            each = self._elements_each, self.outer.count, self.inner.count
+            self._lists[key] = Listed(numbers, each, self._launch)
         return self._lists[key]
-
-    def _make_list(self, numbers: Ints) -> Listed:
-        slots = on_device(np.asarray(numbers, np.int32), wp.int32, self.device)
-
-        def items(kernel: Any, count: int) -> wp.array:
-            found = wp.empty(len(numbers) * count, dtype=wp.int32, device=self.device)
-            self._launch(kernel, (len(numbers), count), [slots, count], [found])
-            return found
-
-        return Listed(
-            numbers,
-            slots,
-            # One element of all slots after the other: neighbouring threads share its constants.
-            items(kernels.expand_across, self._elements_each),
-            # One slot after the other: where a face touches, its neighbours do.
-            items(kernels.expand, self.outer.count),
-            items(kernels.expand, self.inner.count),
-        )
 
     def clear(self, listed: Listed, each: int, array: wp.array) -> None:
         """Set ``each`` numbers of every listed slot to zero."""
@@ -485,7 +467,7 @@ class BatchedEquations:
 
     def longest_move(self, listed: Listed, change: wp.array, lane: int) -> Floats:
         """Longest move of a node of each listed slot [m], (m,); infinite if one is no number."""
-        self._sequences(listed.slots, self._find_longest, listed, change, lane)
+        self._sequences(self._find_longest, listed, change, lane)
         square = self._longest.numpy()[listed.numbers, 0]
         return np.asarray(np.where(square < 1e299, np.sqrt(square), np.inf))
 

@@ -206,7 +206,7 @@ class BatchedFactor:
 
     def factorise(self, slots: wp.array) -> None:
         """Factorise the matrices of the listed slots, (m,) int32; others keep their factors."""
-        self._sequences(slots, self._factorise, slots)
+        self._sequences(self._factorise, slots)
 
     def _factorise(self, slots: wp.array) -> None:
         count, tiles = len(slots), self.tiles
@@ -297,7 +297,7 @@ class BatchedFactor:
             vectors: Right-hand sides, then solutions, (slots, lanes or more, n).
             lanes: How many of them, at most `LANES`.
         """
-        self._sequences(slots, self._solve, slots, vectors, lanes)
+        self._sequences(self._solve, slots, vectors, lanes)
 
     def _solve(self, slots: wp.array, vectors: wp.array, lanes: int) -> None:
         tiles = self.tiles

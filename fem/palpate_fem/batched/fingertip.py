@@ -18,9 +18,9 @@ from palpate.errors import ConfigError, SimulationError
 from palpate.rigid import rotation_matrices
 from palpate_fem.arrays import Floats
 from palpate_fem.batched.equations import BatchedEquations
-from palpate_fem.batched.launches import Sequences
+from palpate_fem.batched.launches import Listed, Sequences
 from palpate_fem.batched.linear import CHANGE, BatchedLinearSystem
-from palpate_fem.batched.state import BatchedState, Listed, SlotNumbers
+from palpate_fem.batched.state import BatchedState, SlotNumbers
 from palpate_fem.batched.steps import BatchedSteps
 from palpate_fem.batched.trajectory import (
     Accept,
@@ -285,9 +285,9 @@ class BatchedFingertip:
                 self._pose(live, begin)
                 listed = self.equations.listed(np.array(begin))
                 self._ratios.assign(ratio)
-                self._sequences(listed.slots, self._extrapolate, listed)
+                self._sequences(self._extrapolate, listed)
             listed, moved = (self.equations.listed(np.array(some, int)) for some in (slots, begin))
-            self._sequences(listed.slots, self._balance, listed, listed, moved)
+            self._sequences(self._balance, listed, listed, moved)
             numbers = self.equations.numbers(self._trial, listed)
             for slot, found in zip(slots, numbers, strict=True):
                 live[slot].numbers = found
@@ -342,7 +342,7 @@ class BatchedFingertip:
             wanted = live[slot].wanted
             assert isinstance(wanted, Step)
             fraction[slot] = min(wanted.damping, most / max(float(far), 1e-300))
-        self._sequences(listed.slots, self._aim, listed, following)
+        self._sequences(self._aim, listed, following)
         left = [slot for slot, far in zip(slots, longest, strict=True) if np.isfinite(far)]
         answers: dict[int, SlotNumbers] = {}
         for _ in range(HALVINGS):
@@ -352,7 +352,7 @@ class BatchedFingertip:
             self._fractions.assign(fraction)
             again = [slot for slot in left if slot in renewing]
             others = equations.listed(np.array(again)) if again else None
-            self._sequences(some.slots, self._move, some, others)
+            self._sequences(self._move, some, others)
             for slot, found in zip(left, equations.numbers(self._trial, some), strict=True):
                 if found.smallest_jacobian > 0.0:
                     answers[slot] = found
@@ -385,7 +385,7 @@ class BatchedFingertip:
             self._go_on(live[slot], self._moves_in(slot, live[slot]))
         if slots := self._asking(live, Accept):
             listed = self.equations.listed(np.array(slots))
-            self._sequences(listed.slots, self._accept, listed)
+            self._sequences(self._accept, listed)
             for slot in slots:
                 live[slot].accepted = live[slot].pose
                 self._go_on(live[slot], None)

@@ -1,6 +1,6 @@
 """Launches that are kept: to pack twenty arguments takes longer than many a kernel.
 
-For one slot even that is too slow: there, on a GPU, a sequence of launches is kept as a graph.
+For few slots even that is too slow: there, on a GPU, a sequence of launches is kept as a graph.
 """
 
 from __future__ import annotations
@@ -9,15 +9,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
+from palpate_fem.arrays import Ints
+from palpate_fem.batched import kernels
 from palpate_fem.batched.dense_tiles import THREADS
 
 KEPT = 2000
 """Launches that are kept: several times those of a sweep."""
 
+FEW = 16
+"""Slots for which graphs are made: with more, kernels take longer than their launches."""
+
 KEPT_GRAPHS = 500
-"""Graphs that are kept: of a slot on its own it takes about ten."""
+"""Graphs that are kept: it takes about ten for each number of slots."""
 
 
 class Launches:
@@ -27,7 +33,7 @@ class Launches:
     """
 
     def __init__(self, device: str) -> None:
-        self._device = device
+        self.device = device
         self._kept: dict[Any, _KeptLaunch] = {}
 
     def __call__(
@@ -60,7 +66,7 @@ class Launches:
                 inputs=inputs,
                 outputs=outputs,
                 block_dim=block,
-                device=self._device,
+                device=self.device,
                 record_cmd=True,
             )
             if len(self._kept) == KEPT:  # of callers with ever new arrays
@@ -80,43 +86,138 @@ class Launches:
         command.launch()
 
 
+class Listed:
+    """Slots to work on, and all that belongs to them; it is listed when it is first asked for.
+
+    Attributes:
+        numbers: The slots, (m,).
+    """
+
+    def __init__(self, numbers: Ints, each: tuple[int, int, int], launch: Launches) -> None:
+        """Note what to list.
+
+        Args:
+            numbers: The slots, (m,).
+            each: Number of elements, of outer and of inner faces of each.
+            launch: On their device.
+        """
+        self.numbers, self.each, self._launch = np.asarray(numbers, np.int32), each, launch
+        self._lists: list[wp.array] | None = None
+
+    @property
+    def slots(self) -> wp.array:
+        """The same on the device."""
+        return self._listed()[0]
+
+    @property
+    def elements(self) -> wp.array:
+        """Numbers of their elements."""
+        return self._listed()[1]
+
+    @property
+    def outer(self) -> wp.array:
+        """Numbers of their outer faces."""
+        return self._listed()[2]
+
+    @property
+    def inner(self) -> wp.array:
+        """Numbers of their inner faces."""
+        return self._listed()[3]
+
+    def others(self) -> Listed:
+        """Lists of as many slots of the same copies, for `change`."""
+        return Listed(np.arange(len(self.numbers), dtype=np.int32), self.each, self._launch)
+
+    def change(self, numbers: Ints) -> None:
+        """List as many other slots; `expand` does the rest."""
+        self.numbers = numbers
+        self._listed()[0].assign(numbers)
+
+    def expand(self) -> None:
+        """Find what belongs to the slots."""
+        slots, *lists = self._listed()
+        # One element of all slots after the other: neighbouring threads share its constants. Of
+        # faces one slot after the other: where a face touches, its neighbours do.
+        ways = (kernels.expand_across, kernels.expand, kernels.expand)
+        for way, count, items in zip(ways, self.each, lists, strict=True):
+            self._launch(way, (len(slots), count), [slots, count], [items])
+
+    def _listed(self) -> list[wp.array]:
+        if self._lists is None:
+            device = self._launch.device
+            self._lists = [wp.array(self.numbers, dtype=wp.int32, device=device)]
+            for count in self.each:
+                size = len(self.numbers) * count
+                self._lists.append(wp.empty(size, dtype=wp.int32, device=device))
+            self.expand()
+        return self._lists
+
+
 class Sequences:
-    """Runs functions that do nothing but launch; for one slot on a GPU, as graphs."""
+    """Runs functions that do nothing but launch; for few slots on a GPU, as graphs.
+
+    A graph belongs to numbers of slots, not to the slots: it reads lists of its own, into which
+    those of a call are copied.
+    """
 
     def __init__(self, device: str) -> None:
         self._device = wp.get_device(device)
-        self._graphs: dict[Any, tuple[wp.Graph | None, Any]] = {}
+        self._graphs: dict[Any, _KeptGraph] = {}
+        self._own: dict[Any, Any] = {}
 
-    def __call__(
-        self, slots: wp.array, launch: Callable[..., object], *arguments: Any, **named: Any
-    ) -> None:
+    def __call__(self, launch: Callable[..., object], *arguments: Any) -> None:
         """Run a function.
 
         Args:
-            slots: Those it launches for; a graph is made and used where it is one.
             launch: It must do nothing else, wait for nothing, and launch the same with the same
-                arguments, whose contents may change. A graph may hold others that it calls.
+                arguments, whose contents may change, and with other lists of as many slots. A
+                graph may hold others that it calls.
             arguments: Of the function.
-            named: Of the function.
         """
-        if len(slots) != 1 or not self._device.is_cuda or self._device.is_capturing:
-            launch(*arguments, **named)
+        cuda = self._device.is_cuda and not self._device.is_capturing
+        if not cuda or any((_slots(one) or 0) > FEW for one in arguments):
+            launch(*arguments)
             return
-        of = [*arguments, *(part for pair in sorted(named.items()) for part in pair)]
-        key = (launch, *((one if isinstance(one, int | float | str) else id(one)) for one in of))
-        if key not in self._graphs:  # the first time it compiles what it needs
-            launch(*arguments, **named)
+        key = (launch, *map(_kind, arguments))
+        kept = self._graphs.get(key)
+        if kept is None:  # the first time it compiles what it needs
+            launch(*arguments)
             if len(self._graphs) == KEPT_GRAPHS:
                 self._graphs.clear()
-            self._graphs[key] = None, of  # kept, so that no other gets an id of these
+            self._graphs[key] = _KeptGraph(None, arguments)
             return
-        graph, _ = self._graphs[key]
-        if graph is None:
+        if kept.graph is None:
+            kept.arguments = tuple(map(self._own_list, range(len(arguments)), arguments))
             with wp.ScopedCapture(self._device) as capture:
-                launch(*arguments, **named)
-            graph = capture.graph
-            self._graphs[key] = graph, of
-        wp.capture_launch(graph)
+                for own in kept.arguments:
+                    if isinstance(own, Listed):
+                        own.expand()
+                launch(*kept.arguments)
+            kept.graph = capture.graph
+        for own, given in zip(kept.arguments, arguments, strict=True):
+            if isinstance(given, Listed):
+                own.change(given.numbers)
+            elif _slots(given):
+                wp.copy(own, given)
+        wp.capture_launch(kept.graph)
+
+    def _own_list(self, place: int, argument: Any) -> Any:
+        """A list like an argument, which all graphs share at this place; others as they are."""
+        if not (count := _slots(argument)):
+            return argument
+        key = (place, type(argument), count)
+        if key not in self._own:
+            listed = isinstance(argument, Listed)
+            self._own[key] = argument.others() if listed else wp.empty_like(argument)
+        return self._own[key]
+
+
+@dataclass(slots=True)
+class _KeptGraph:
+    """A graph, made at the second call, and its arguments, which it keeps alive."""
+
+    graph: wp.Graph | None
+    arguments: tuple[Any, ...]
 
 
 @dataclass(slots=True)
@@ -131,6 +232,20 @@ class _KeptLaunch:
 
 def _is_list(argument: Any) -> bool:
     return isinstance(argument, wp.array) and argument.dtype is wp.int32 and argument.ndim == 1
+
+
+def _slots(argument: Any) -> int | None:
+    """Of a list of slots how many there are; None for all else."""
+    if isinstance(argument, Listed):
+        return len(argument.numbers)
+    return len(argument) if _is_list(argument) else None
+
+
+def _kind(argument: Any) -> Any:
+    """What tells arguments of a graph apart; it is kept, so that no other gets its id."""
+    if (count := _slots(argument)) is not None:
+        return type(argument), count
+    return argument if isinstance(argument, int | float | str) else id(argument)
 
 
 def _identity(argument: Any) -> Any:

@@ -16,8 +16,8 @@ from palpate_fem.batched import kernels
 from palpate_fem.batched.dense_tiles import THREADS
 from palpate_fem.batched.equations import BatchedEquations
 from palpate_fem.batched.factor import BatchedFactor
-from palpate_fem.batched.launches import Launches, Sequences
-from palpate_fem.batched.state import BatchedState, Listed
+from palpate_fem.batched.launches import Launches, Listed, Sequences
+from palpate_fem.batched.state import BatchedState
 
 Flags = NDArray[np.bool_]
 
@@ -72,9 +72,7 @@ class BatchedLinearSystem:
         Returns:
             Whether each is positive definite, (m,).
         """
-        self._sequences(
-            listed.slots, self._factorise, state, listed, elastic=elastic, viscosity=viscosity
-        )
+        self._sequences(self._factorise, state, listed, elastic, viscosity)
         self._has_border[listed.numbers] = False
         return np.asarray(self.factor.bad.numpy()[listed.numbers] == 0)
 
@@ -107,7 +105,7 @@ class BatchedLinearSystem:
         missing = np.zeros(self.equations.slots)
         missing[listed.numbers] = missing_m3
         self._missing.assign(missing)
-        self._sequences(listed.slots, self._solve, state, listed, fresh, following)
+        self._sequences(self._solve, state, listed, fresh, following)
 
     def _solve(
         self, state: BatchedState, listed: Listed, fresh: Listed, following: Listed | None

@@ -1,4 +1,4 @@
-"""Solutions of many copies of a fingertip, on the device, and lists of the copies to work on."""
+"""Solutions of many copies of a fingertip, on the device."""
 
 from __future__ import annotations
 
@@ -39,25 +39,6 @@ class SlotNumbers:
     net_force: Floats
     fluid_pressure: float
     sets_changed: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Listed:
-    """Slots to work on, and all that belongs to them.
-
-    Attributes:
-        numbers: The slots, (m,).
-        slots: The same on the device.
-        elements: Numbers of their elements.
-        outer: Numbers of their outer faces.
-        inner: Numbers of their inner faces.
-    """
-
-    numbers: Ints
-    slots: wp.array
-    elements: wp.array
-    outer: wp.array
-    inner: wp.array
 
 
 class BatchedState:

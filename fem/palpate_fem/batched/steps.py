@@ -12,7 +12,7 @@ import warp as wp
 from palpate_fem.arrays import Floats
 from palpate_fem.batched import kernels, reductions
 from palpate_fem.batched.equations import BatchedEquations
-from palpate_fem.batched.launches import Launches
+from palpate_fem.batched.launches import Launches, Listed
 from palpate_fem.batched.reductions import (
     AREA,
     FORCE,
@@ -23,7 +23,7 @@ from palpate_fem.batched.reductions import (
     TORQUE,
     WEIGHT,
 )
-from palpate_fem.batched.state import BatchedState, Listed, flat, on_device
+from palpate_fem.batched.state import BatchedState, flat, on_device
 from palpate_fem.mechanics.load_stepping import CONTACT_SHARE
 from palpate_fem.mechanics.reference_element import face_element
 from palpate_fem.result import Convergence, IndentationStep

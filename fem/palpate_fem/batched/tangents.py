@@ -13,8 +13,8 @@ import numpy as np
 import warp as wp
 
 from palpate_fem.batched import kernels, point_kernels
-from palpate_fem.batched.launches import Launches
-from palpate_fem.batched.state import BatchedState, Listed, flat, on_device
+from palpate_fem.batched.launches import Launches, Listed
+from palpate_fem.batched.state import BatchedState, flat, on_device
 from palpate_fem.batched.surface import BatchedSurface
 from palpate_fem.mechanics.element_kernels import Scales
 from palpate_fem.mechanics.system import EquilibriumSystem
