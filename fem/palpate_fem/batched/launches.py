@@ -124,14 +124,17 @@ class Listed:
         """Numbers of their inner faces."""
         return self._listed()[3]
 
-    def others(self) -> Listed:
-        """Lists of as many slots of the same copies, for `change`."""
-        return Listed(np.arange(len(self.numbers), dtype=np.int32), self.each, self._launch)
+    def like(self) -> Listed:
+        """Lists of as many slots, for `change`."""
+        other = Listed(self.numbers, self.each, self._launch)
+        other._listed()  # a graph that is being made could not
+        return other
 
     def change(self, numbers: Ints) -> None:
         """List as many other slots; `expand` does the rest."""
         self.numbers = numbers
-        self._listed()[0].assign(numbers)
+        if len(numbers):
+            self.slots.assign(numbers)
 
     def expand(self) -> None:
         """Find what belongs to the slots."""
@@ -197,18 +200,18 @@ class Sequences:
         for own, given in zip(kept.arguments, arguments, strict=True):
             if isinstance(given, Listed):
                 own.change(given.numbers)
-            elif _slots(given):
+            elif _is_list(given):
                 wp.copy(own, given)
         wp.capture_launch(kept.graph)
 
     def _own_list(self, place: int, argument: Any) -> Any:
         """A list like an argument, which all graphs share at this place; others as they are."""
-        if not (count := _slots(argument)):
+        if (count := _slots(argument)) is None:
             return argument
         key = (place, type(argument), count)
         if key not in self._own:
             listed = isinstance(argument, Listed)
-            self._own[key] = argument.others() if listed else wp.empty_like(argument)
+            self._own[key] = argument.like() if listed else wp.empty_like(argument)
         return self._own[key]
 
 
