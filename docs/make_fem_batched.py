@@ -7,7 +7,8 @@
     python tests/benchmarks/bench_sweep.py ... --out sweeps.json
     python docs/make_fem_batched.py
 
-These files are in docs/results/fem-batched. ``sweeps.json`` holds what was told of large data sets,
+These files are in docs/results/fem-batched. ``few.json`` holds runs of two commits in turns, each
+as the first command writes them. ``sweeps.json`` holds what was told of large data sets,
 too.
 """
 
@@ -78,6 +79,20 @@ def times(runs: list[dict[str, Any]]) -> str:
             for run in runs
         ],
     )  # fmt: skip
+
+
+def in_turns(runs: list[dict[str, Any]]) -> str:
+    """A row for each number of slots, a column for each commit."""
+    commits = list(dict.fromkeys(run["commit"] for run in runs))
+    rows = []
+    for slots in sorted({run["slots"] for run in runs}):
+        ours = [run for run in runs if run["slots"] == slots]
+        times = [
+            ", ".join(f"{run['ms_while_full']:.0f}" for run in ours if run["commit"] == commit)
+            for commit in commits
+        ]
+        rows.append([str(slots), str(ours[0]["presses"]), *times])
+    return markdown_table(["slots", "presses", *(f"{c} [ms]" for c in commits)], rows)
 
 
 def agreement(report: dict[str, Any], folder: Path) -> str:
@@ -216,7 +231,7 @@ def swept(runs: list[dict[str, Any]]) -> str:
 def main() -> None:
     """Write page and pictures."""
     report, meshes = read("slots.json"), read("meshes.json")
-    factor, sweeps = read("factor.json"), read("sweeps.json")
+    factor, sweeps, few = read("factor.json"), read("sweeps.json"), read("few.json")
     runs = report["runs"] + meshes["runs"]
     draw([run for run in runs if "together" not in run], FOLDER / "time.png")
     sections = [
@@ -227,6 +242,10 @@ def main() -> None:
         " (`nvidia-cuda-mps-control -d`), so that kernels of all of them run at once.\n",
         times(runs),
         "\n![time](fem-batched/time.png)\n",
+        f"Few slots, {few['device']}: `{few['command']}`, time of a trajectory with all slots"
+        f" taken. {few['told']}\n",
+        in_turns(few["runs"]),
+        "",
         f"## Agreement with the solver on a core\n\n`{report['agreement_command']}`, and the same"
         f" with `--tightened 10`. {report['agreement_told']}\n",
         agreement(report, FOLDER),
