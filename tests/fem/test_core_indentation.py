@@ -13,7 +13,7 @@ from palpate.errors import SimulationError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.iteration import NewtonSettings
-from palpate_fem.mechanics.load_stepping import SolverSettings
+from palpate_fem.mechanics.load_stepping import ConvergedIncrement, SolverSettings
 from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mechanics.state import SolutionState
@@ -88,6 +88,25 @@ def test_without_contact_nothing_happens(finger: Fingertip) -> None:
         assert np.isnan(step.centre_of_pressure).all()
         assert step.fluid_pressure_pa == finger.fluid_pressure_pa
         assert step.convergence.penetration_m == 0.0
+
+
+def test_an_indenter_meets_the_skin_that_lies_between_two_poses(
+    finger: Fingertip, fill: Fill, settled: SolverSettings
+) -> None:
+    """Through the finger in one step, and along it without a touch at either end."""
+    through = press_path(finger, -1e-3, 40e-3)[1:]
+    stopped = finger.indent(BALL, through)
+    assert stopped.outcome is not IndentationOutcome.COMPLETE
+    assert 1e-3 < stopped.travel_m < 10e-3
+    smooth = fill(settled, friction_coefficient=0.0)
+    along = press_path(smooth, 0.3e-3, 0.3e-3)[1:]
+    along[0, 0], along[1, 0] = -0.02, 0.02
+    told: list[ConvergedIncrement] = []
+    run = smooth.load_stepping(BALL, along, history=told)
+    assert run.run().outcome is IndentationOutcome.COMPLETE
+    assert not told[0].state.indenter_pressure.any()
+    assert not told[-1].state.indenter_pressure.any()
+    assert any(one.state.indenter_pressure.any() for one in told)
 
 
 def test_pressing_leaves_the_fingertip_as_it_was(finger: Fingertip) -> None:
@@ -186,9 +205,10 @@ def test_what_cannot_be_solved_is_reported_with_what_could(hasty: Fingertip) -> 
     assert trajectory.outcome is IndentationOutcome.DIVERGED
     assert_same_steps(trajectory.steps, hasty.indent(BALL, path[:3]).steps)
     assert len(trajectory.steps) == 2
-    assert trajectory.travel_m == pytest.approx(0.402e-3, rel=1e-9)
-    assert trajectory.reason.endswith(", 0.402 mm along the path")
-    assert len(trajectory.reason) > len(", 0.402 mm along the path")
+    assert 0.4e-3 < trajectory.travel_m < 3.4e-3
+    where = f", {trajectory.travel_m * 1e3:.3f} mm along the path"
+    assert trajectory.reason.endswith(where)
+    assert len(trajectory.reason) > len(where)
     # and it can be used again
     assert hasty.indent(BALL, path[:3]).outcome is IndentationOutcome.COMPLETE
 

@@ -28,6 +28,7 @@ from palpate_fem.mechanics.load_stepping import (
     SNAP,
     SUCTION_PA,
     SolverSettings,
+    pieces_of,
 )
 from palpate_fem.result import IndentationOutcome
 
@@ -119,10 +120,11 @@ class BatchedTrajectory:
         size = 1.0
         for k in range(1, len(self.path)):
             increments = iterations = factorisations = 0
-            done = 0.0
+            done, way = 0.0, lengths[k] - lengths[k - 1]
+            pieces = pieces_of(way)
             while done < 1.0 - 1e-9:
-                size = min(size, 1.0 - done)
-                goal = done + size
+                size = min(size, (1.0 - done) * pieces)
+                goal = done + size / pieces
                 if 1.0 - goal < 1e-6:
                     goal = 1.0
                 solved = yield from self._increment(
@@ -134,7 +136,7 @@ class BatchedTrajectory:
                 factorisations += report.factorisations
                 if report.converged:
                     done = goal
-                    self.travel_m = lengths[k - 1] + done * (lengths[k] - lengths[k - 1])
+                    self.travel_m = lengths[k - 1] + done * way
                     if report.iterations <= EASY_ITERATIONS:
                         size = min(1.0, 2.0 * size)
                     self._check_force()

@@ -1,11 +1,12 @@
 """Load stepping: the increments of one indentation, their cut-backs, and where it ends.
 
 A step is the way from one pose of a path to the next. It is solved in one increment of the load, or
-in several shorter ones where Newton's method needs them.
+in several shorter ones where it is long or Newton's method needs them.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -52,6 +53,12 @@ SUCTION_PA = 1.0
 
 EASY_ITERATIONS = 8
 """After an increment that took no more Newton iterations than this, the next is twice as long."""
+
+LONGEST_M = 0.5e-3
+"""Longest travel of an increment [m].
+
+An equilibrium is found where the indenter is, not on the way there: in one leap it could pass
+through the finger without a touch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +113,7 @@ class _Progress:
         indenter: At the pose of that solution.
         load: Nodal forces of the indenter on the skin [N], (V, 3).
         previous: Solution one increment before, for the predictor; None = no prediction.
-        previous_length: Length of the increment between the two, in steps.
+        previous_length: Length of the increment between the two, as in `LoadStepping.increment`.
     """
 
     state: SolutionState
@@ -114,6 +121,11 @@ class _Progress:
     load: Floats
     previous: SolutionState | None = None
     previous_length: float = 0.0
+
+
+def pieces_of(travel_m: float) -> int:
+    """Into how many equal increments a step of so much travel [m] is divided at least."""
+    return max(1, math.ceil(travel_m / LONGEST_M - 1e-6))
 
 
 def moves_in(position: Floats, load: Floats, at: PosedIndenter, to: PosedIndenter) -> bool:
@@ -197,14 +209,15 @@ class LoadStepping:
         lengths = path_lengths(self.path)
         steps: list[IndentationStep] = []
         travel = 0.0
-        size = 1.0  # of the next increment, as a share of its step
+        size = 1.0  # of the next increment, as a share of its step, or of a piece of a long one
         for k in range(1, len(self.path)):
-            cost, done = _StepCost(), 0.0
+            cost, done, way = _StepCost(), 0.0, lengths[k] - lengths[k - 1]
+            pieces = pieces_of(way)
             while done < 1.0 - 1e-9 and self.outcome is None:
                 if self._stop():
                     break
-                size = min(size, 1.0 - done)
-                goal = done + size
+                size = min(size, (1.0 - done) * pieces)
+                goal = done + size / pieces
                 if 1.0 - goal < 1e-6:
                     goal = 1.0  # the poses of the path are reached exactly
                 pose = interpolate_pose(self.path[k - 1], self.path[k], goal)
@@ -220,7 +233,7 @@ class LoadStepping:
                 if report.converged:
                     done = goal
                     self._record(k, done)
-                    travel = lengths[k - 1] + done * (lengths[k] - lengths[k - 1])
+                    travel = lengths[k - 1] + done * way
                     if report.iterations <= EASY_ITERATIONS:
                         size = min(1.0, 2.0 * size)
                     self._check_force(balance, travel)
@@ -256,7 +269,7 @@ class LoadStepping:
 
         Args:
             pose: Pose of the indenter (7,).
-            length: Length of the increment, in steps.
+            length: Length of the increment, in steps, or in pieces of a long one.
         """
         start = self.at.state
         indenter = self.at.indenter.at(pose)
