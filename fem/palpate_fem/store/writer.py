@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 
 from palpate.errors import ConfigError, DatasetError
+from palpate.files.hdf5 import new_file
 from palpate.files.simulation_store import FINGERTIP, SUFFIX, TRAJECTORIES, check_id
 from palpate.process import Closing
 from palpate_fem.result import IndentationResult
@@ -291,7 +292,7 @@ def export(
     names = store.ids() if ids is None else list(ids)
     with FileClaim(path) as claim:
         try:
-            with h5py.File(claim.part, "w", libver=LIBVER, locking=False) as target:
+            with new_file(claim.part, extra="fem", libver=LIBVER) as target:
                 write_header(target, command=command)
                 _copy(store.path / FINGERTIP, "fingertip", target)
                 for at, name in enumerate(names):
@@ -300,7 +301,7 @@ def export(
                     store.summary(name)  # raises a readable error if it is damaged
                     group = f"{TRAJECTORIES}/{name}"
                     _copy(store.path / f"{group}.h5", group, target)
-        except (OSError, RuntimeError) as error:  # HDF5 reports a full disk when it closes
+        except (OSError, RuntimeError) as error:
             raise disk_error(path, OSError(str(error))) from error
         claim.finish()
     return len(names)

@@ -7,6 +7,7 @@ optional, and imported when a file is opened.
 from __future__ import annotations
 
 import contextlib
+import io
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 SENSOR_FRAME = "sensor frame: x distal, y lateral, z dorsal; force is the force on the BioTac"
 """Frame of every file, and the text of its attribute ``frame``."""
 
+_VALUES_BYTES = 64 << 10  # no block of what HDF5 notes about values is as large
 _FREE_BYTES = 64 << 20
 _RATIO_MAX = 100  # of what an array may expand to; those of palpate expand to ten times at most
 
@@ -121,6 +123,77 @@ def opened(
 
 
 @contextlib.contextmanager
+def new_file(path: Path, *, extra: str, libver: Any = None) -> Iterator[h5py.File]:
+    """An HDF5 file to write to; ``libver`` as h5py has it.
+
+    Raises:
+        OSError: The disk refused; the file is of no use then.
+        MissingExtraError: h5py is not installed; ``extra`` of palpate installs it.
+    """
+    h5 = h5py_module(extra)
+    with _ForHdf5(path) as disk:
+        file = h5.File(disk, "w", libver=libver)
+        try:
+            yield file
+        except Exception as error:
+            if disk.refused is not None:
+                raise disk.refused from error
+            raise
+        finally:
+            file.close()
+        if disk.refused is not None:
+            raise disk.refused
+
+
+class _ForHdf5(io.FileIO):
+    """A file whose writes never fail; what the disk refuses is kept in memory, if it is small.
+
+    HDF5 writes much when it closes a file or a data set. If that is refused, it tries again when
+    the process ends, and crashes it. Large blocks are values, which it does not need.
+
+    Attributes:
+        refused: What the disk said first.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "w+")
+        self.refused: OSError | None = None
+        self._kept: list[tuple[int, bytes]] = []
+
+    def write(self, data: Any) -> int:
+        """Write all of it."""
+        block, at = memoryview(data).cast("B"), self.tell()
+        done = 0
+        while self.refused is None and done < len(block):
+            try:
+                done += super().write(block[done:])
+            except OSError as error:
+                self.refused = error
+        if self.refused is not None and len(block) < _VALUES_BYTES:
+            self._kept.append((at, bytes(block)))
+        return len(block)
+
+    def readinto(self, buffer: Any) -> int:
+        """Read what was written, in whichever place."""
+        block, at = memoryview(buffer).cast("B"), self.tell()
+        found = super().readinto(block) or 0
+        block[found:] = bytes(len(block) - found)
+        for place, kept in self._kept:
+            first, last = max(at, place), min(at + len(block), place + len(kept))
+            if first < last:
+                block[first - at : last - at] = kept[first - place : last - place]
+        return len(block)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the size; a disk that is full keeps its own."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.refused = self.refused or error
+            return size or 0
+
+
+@contextlib.contextmanager
 def hdf5_written_whole(path: Path, *, extra: str) -> Iterator[h5py.File]:
     """An HDF5 file to write to, which gets its name when the block ends without an error.
 
@@ -131,8 +204,7 @@ def hdf5_written_whole(path: Path, *, extra: str) -> Iterator[h5py.File]:
         DatasetError: The disk refused, or another kind of file is there.
         MissingExtraError: h5py is not installed.
     """
-    h5 = h5py_module(extra)
-    with written_whole(path) as partial, h5.File(partial, "w") as file:
+    with written_whole(path) as partial, new_file(partial, extra=extra) as file:
         yield file
         _check_replaced(path, text(file.attrs.get("schema", "")), extra)
 

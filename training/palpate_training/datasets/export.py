@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import DatasetError
+from palpate.files.hdf5 import new_file
 from palpate.messages import COUNTS_MAX
-from palpate.process import require
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
 from palpate_training.datasets.features import ELECTRODES, FeatureDataset, FloatArray
 from palpate_training.datasets.published import published_file
@@ -54,7 +54,6 @@ def export_published(folder: Path, data: ExperimentDataset | MixedDataset) -> li
     Raises:
         DatasetError: The folder exists, or the disk refused.
     """
-    h5 = require("h5py", extra="training")
     rows = data.experiment if isinstance(data, MixedDataset) else data
     names: list[str] = []
 
@@ -63,11 +62,11 @@ def export_published(folder: Path, data: ExperimentDataset | MixedDataset) -> li
         for unit, number in enumerate(_numbers(rows.unit_names)):
             trials = np.flatnonzero(rows.trial_unit == unit)
             path = published_file(partial, number)
-            _write_unit(h5, path, rows, trials)
+            _write_unit(path, rows, trials)
             names.append(path.name)
             if isinstance(data, MixedDataset):
                 simulated = path.with_name(f"{path.stem}_simulated.hdf5")
-                _write_simulated(h5, simulated, data, trials)
+                _write_simulated(simulated, data, trials)
                 names.append(simulated.name)
 
     written_new(folder, write)
@@ -141,11 +140,11 @@ def written_new(path: Path, write: Callable[[Path], None]) -> None:
                 partial.unlink()
 
 
-def _write_unit(h5: Any, path: Path, rows: ExperimentDataset, trials: Any) -> None:
+def _write_unit(path: Path, rows: ExperimentDataset, trials: Any) -> None:
     mine = np.isin(rows.trial, trials)
     kinds = sorted(set(rows.indenters))
     number = np.array([kinds.index(indenter) for indenter in rows.indenters], np.int64)
-    with h5.File(path, "w") as file:
+    with new_file(path, extra="training") as file:
         file.attrs.update({f"provenance.{k}": v for k, v in asdict(rows.provenance).items()})
         for group, values in (
             ("electrode_vals", rows.tared[mine]),
@@ -160,10 +159,10 @@ def _write_unit(h5: Any, path: Path, rows: ExperimentDataset, trials: Any) -> No
                 dataset.attrs["names"] = kinds
 
 
-def _write_simulated(h5: Any, path: Path, data: MixedDataset, trials: Any) -> None:
+def _write_simulated(path: Path, data: MixedDataset, trials: Any) -> None:
     mine = np.isin(data.experiment.trial, trials)
     shape = (int(mine.sum()), *data.mesh.nodes.shape)
-    with h5.File(path, "w") as file:
+    with new_file(path, extra="training") as file:
         file.create_dataset("force_res", data=data.simulated_force[mine])
         field = file.create_dataset(
             "nodal_res",
