@@ -366,6 +366,30 @@ def test_serve_answers_until_it_is_told_to_stop(link: LinkConfig) -> None:
         process.wait()
 
 
+def test_each_serve_answers_for_its_own_sensor(link: LinkConfig) -> None:
+    common = ("serve", "--connect", link.connect[0], "--workers", 1)
+    processes = [
+        spawn(*common, "--sensor", sensor, "--shear-modulus-kpa", modulus)
+        for sensor, modulus in (("soft", 100), ("hard", 1000))
+    ]
+    try:
+        with Client(link.connect[0], timeout_s=5) as robot:
+            deadline = time.monotonic() + PATIENCE_S
+            while sum(process.ready for process in robot.alive()) < 2:
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+            assert len({process.instance for process in robot.alive()}) == 2
+            soft, hard = (
+                robot.simulate(fakes.request(sensor), sensor=sensor).steps[-1].force[2]
+                for sensor in ("soft", "hard")
+            )
+            assert hard == pytest.approx(10.0 * soft)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
 def test_serve_without_a_router(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("palpate_fem.cli.run._ROUTER_WAIT_S", 0.2)
     with pytest.raises(LinkError, match="no router"):

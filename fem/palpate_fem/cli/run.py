@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import statistics
+import uuid
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -363,7 +364,14 @@ def serve_command(
         to=console,
     )
     node.run(
-        config, link, station, stop, on_ready=lambda: print_lines("ready for requests", to=console)
+        config,
+        link,
+        station,
+        stop,
+        # Callers choose a service by this name, so no other at the station may have it.
+        instance=f"{node.SERVICE}-{uuid.uuid4().hex[:8]}",
+        on_ready=lambda: print_lines("ready for requests", to=console),
+        on_refusal=lambda refusal: print_lines(f"does not serve: {refusal}", to=console),
     )
 
 
