@@ -22,7 +22,7 @@ from typer.testing import CliRunner, Result
 from palpate.client import Client
 from palpate.client.simulations import straight_path
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, LinkError, MissingExtraError, PalpateError
+from palpate.errors import ConfigError, DatasetError, LinkError, MissingExtraError, PalpateError
 from palpate.messages import SimulationOutcome, SimulationParameters, SimulationRequest
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation, write_indentations
 from palpate_fem.calibration.result import read_parameters
@@ -224,6 +224,7 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
         (("--poses", "a.csv", "--at-mm", 0, 0), "--at-mm has no effect"),
         (("--seed", 3), "--seed has no effect with a single press"),
         (("--stress",), "--store"),
+        (("--png", "measured.h5"), ".png"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(words: tuple[object, ...], said: str) -> None:
@@ -271,6 +272,51 @@ def test_calibrate_then_validate(measured: Path, tmp_path: Path) -> None:
     assert json.loads((out / "validation.json").read_text())["median_n"] < 0.05
     with pytest.raises(ConfigError, match="begins with ring"):
         fem("validate", measured, "--only", "ring")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("calibrate", "measured.h5", "--out", "measured.h5"), ".json"),
+        (("calibrate", "measured.h5", "--png", "measured.h5"), ".png"),
+        (("calibrate", "linked.json", "--out", "linked.json"), "reads"),
+        (("calibrate", "linked.json", "--out", "./again.json"), "reads"),
+        (("calibrate", "measured.h5", "--out", "folder.json"), "is a folder"),
+        (("calibrate", "measured.h5", "--png", "folder.png"), "is a folder"),
+        (("calibrate", "measured.h5", "--out", "measured.h5/fit.json"), "no folder"),
+        (("validate", "measured.h5", "--out", "measured.h5"), "no folder"),
+        (("units", "draw", 2, "--out", "measured.h5"), ".json"),
+        (("units", "fit", "a.sim", "--out", "measured.h5"), ".json"),
+        (("units", "fit", "a.sim", "--recording", "b.h5", "--out", "b.h5"), ".json"),
+        (("study", "mesh", "--png", "measured.h5"), ".png"),
+    ],
+)
+def test_what_would_replace_another_file_is_refused_at_once(
+    measured: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...], said: str
+) -> None:
+    monkeypatch.chdir(measured.parent)
+    before = measured.read_bytes()
+    Path("folder.json").mkdir()
+    Path("folder.png").mkdir()
+    for name in ("linked.json", "again.json"):
+        Path(name).symlink_to(measured)
+    with pytest.raises(ConfigError, match=said):
+        fem(*words)
+    assert measured.read_bytes() == before
+
+
+def test_what_was_found_is_told_though_the_disk_refuses(
+    measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise DatasetError("no space", remedy="free some")
+
+    monkeypatch.setattr("palpate_fem.cli.identify.write_calibration", refuse)
+    words = ["calibrate", str(measured), "--out", str(tmp_path / "fit.json"), "--workers", "2"]
+    done = CliRunner().invoke(fem_app, words)
+    assert isinstance(done.exception, DatasetError)
+    assert "shear_modulus_pa" in done.stdout
+    assert "wrote" not in done.stdout
 
 
 def test_a_missing_extra_gives_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,7 @@ from palpate_fem.calibration.result import without_nan
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import (
+    check_output,
     console,
     print_lines,
     print_table,
@@ -150,6 +151,7 @@ class RunOptions:
                     remedy="add --sweep, or leave it out",
                 )
         check_places(self.devices, self.slots, self.ray)
+        check_output(self.png, "--png", ".png")
         if self.store is not None and self.store.suffix != SUFFIX:
             raise ConfigError(
                 f"--store {self.store} does not end in {SUFFIX}",
