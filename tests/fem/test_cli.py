@@ -319,6 +319,14 @@ def test_what_was_found_is_told_though_the_disk_refuses(
     assert "wrote" not in done.stdout
 
 
+@pytest.mark.parametrize(
+    "words", [("--edge-mm", 0.9), ("--layers", 1), ("--parameters", "a.json"), ("--mesh", "biotac")]
+)
+def test_a_store_is_compared_as_it_is(words: tuple[object, ...]) -> None:
+    with pytest.raises(ConfigError, match=f"{words[0]} has no effect with --store"):
+        fem("validate", "measured.h5", "--store", "a.sim", *words)
+
+
 def test_a_missing_extra_gives_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "palpate_fem.cli.run", None)
     monkeypatch.setattr("palpate_fem.cli.app.EXTRA_MODULES", ("palpate_fem",))
