@@ -185,6 +185,38 @@ def test_one_press_into_a_store_is_run_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("words", "kind", "code"),
+    [
+        (("--steps", 3), "DIVERGES", 1),
+        (("--steps", 3), "PINCHES", 0),
+        (("--sweep", "--points", 1, "--angled", 0, "--indenter", "cube"), "DIVERGES", 1),
+    ],
+)
+def test_what_failed_before_fails_the_same_command(
+    tmp_path: Path, words: tuple[object, ...], kind: str, code: int
+) -> None:
+    store, friction = tmp_path / "a.sim", getattr(fakes, kind)
+    for run in ("1 of 1 run", "0 of 0 run; 1 were there already"):
+        done = fem("run", *words, "--store", store, friction=friction)
+        assert run in done.stdout
+        assert done.exit_code == code
+    assert ("of which 1 did not complete" in done.stdout) is (code == 1)
+
+
+def test_a_store_keeps_stress_of_all_or_of_none(tmp_path: Path) -> None:
+    with_stress, without = tmp_path / "with.sim", tmp_path / "without.sim"
+    assert fem("run", "--steps", 3, "--store", with_stress, "--stress").exit_code == 0
+    assert fem("run", "--steps", 3, "--store", without).exit_code == 0
+    for steps in (3, 4):
+        with pytest.raises(DatasetError, match="without stress") as caught:
+            fem("run", "--steps", steps, "--store", without, "--stress")
+    assert "leave out --stress" in caught.value.remedy
+    with pytest.raises(DatasetError, match="with stress"):
+        fem("run", "--steps", 4, "--store", with_stress)
+    assert fem("run", "--steps", 4, "--store", with_stress, "--stress").exit_code == 0
+
+
+@pytest.mark.parametrize(
     ("kind", "code", "said"),
     [
         ("PINCHES", 0, "force limit"),

@@ -219,7 +219,8 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
     """Run, show, draw.
 
     Returns:
-        0, or 1 if a trajectory neither completed nor ended at the force limit.
+        0, or 1 if a trajectory, of those that were there already, too, neither completed nor ended
+        at the force limit.
     """
     options.check()
     sweep, store = options.sweep, options.store
@@ -232,7 +233,7 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
         ray=options.ray,
     )
     done: list[IndentationResult] = []
-    present = 0
+    present = earlier = 0
     with (
         stop_on_signal() as stop,
         make_batch() as batch,
@@ -272,10 +273,14 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
                 command=typed_command(),
                 packers=packers,
             )
-    if store is not None and not sweep:
+    if store is not None:
         opened = SimulationStore.open(store)
         there = set(opened.ids())
-        done = [opened.trajectory(plan.name) for plan in plans if plan.name in there]
+        held = [plan.name for plan in plans if plan.name in there]
+        new = {early.name for early in report.early}
+        earlier = sum(opened.outcome(name).value not in GOOD for name in held if name not in new)
+        if not sweep:
+            done = [opened.trajectory(name) for name in held]
     if options.as_json:
         write_json(fingertip, done, report, present, options.places)
     else:
@@ -284,10 +289,11 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
             show_summaries(store, [plan.name for plan in plans])
         for trajectory in done:
             show_trajectory(fingertip, trajectory)
-        show_report(report, present, store, options.places)
+        show_report(report, present, store, options.places, earlier=earlier)
     if options.png is not None:
         _draw(options.png, fingertip, done, store if sweep else None)
-    return 0 if not report.stopped and all(early.how in GOOD for early in report.early) else 1
+    failed = earlier or any(early.how not in GOOD for early in report.early)
+    return 1 if report.stopped or failed else 0
 
 
 def export_command(store: Path, out: Path) -> None:
@@ -436,9 +442,17 @@ def show_summaries(store: Path, names: Sequence[str]) -> None:
 
 
 def show_report(
-    report: BatchReport, present: int, store: Path | None, places: Sequence[str] = ()
+    report: BatchReport,
+    present: int,
+    store: Path | None,
+    places: Sequence[str] = (),
+    *,
+    earlier: int = 0,
 ) -> None:
-    """Print every early end, and a summary; with places also how quick these were."""
+    """Print every early end, and a summary; with places also how quick these were.
+
+    Of the ``present`` ones, ``earlier`` ended otherwise than in ``GOOD``.
+    """
     if report.early:
         more = len(report.early) - _SHOWN_EARLY
         print_table(
@@ -453,7 +467,10 @@ def show_report(
     outcomes = ", ".join(f"{count} {how}" for how, count in sorted(report.outcomes.items()))
     parts = [f"{report.done} of {report.total} run" + (f": {outcomes}" if outcomes else "")]
     if present:
-        parts.append(f"{present} were there already")
+        parts.append(
+            f"{present} were there already"
+            + (f", of which {earlier} did not complete" if earlier else "")
+        )
     if places and report.done:
         each_ms = report.wall_s / report.done * 1e3
         parts.append(f"{each_ms:.0f} ms a trajectory on {', '.join(places)}")
