@@ -114,7 +114,7 @@ def test_a_path_that_slides_twists_and_leaves_is_solved_over_the_wire(
         dry = dataclasses.replace(
             asked, request_id="dry", parameters=SimulationParameters(fluid_volume_m3=0.3e-6)
         )
-        with pytest.raises(RemoteError, match=r"0.300 ml of fluid suck the skin inwards, at -\d"):
+        with pytest.raises(RemoteError, match=r"0.300 ml of fluid suck the skin inwards"):
             service.robot.simulate(dry, timeout_s=120)
     here = tip.indent("sphere_medium", path, friction_coefficient=parameters.friction_coefficient)
     assert reply.outcome is SimulationOutcome.COMPLETE
