@@ -167,7 +167,7 @@ def test_the_bench_tells_times_and_rates_of_the_solver() -> None:
 def test_a_sweep_is_resumed_and_drawn(tmp_path: Path) -> None:
     store, png = tmp_path / "a.sim", tmp_path / "a.png"
     words = ("run", "--sweep", "--points", 1, "--steps", 3, "--store", store, "--workers", 2)
-    done = fem(*words, "--indenter", "cube", "--indenter", "ring")
+    done = fem(*words, "--indenter", "cube", "--indenter", "ring", "--indenter", "cube_14mm")
     assert done.exit_code == 0
     assert "10 of 10 run: 10 complete" in done.stdout
     done = fem(*words, "--indenter", "cube", "--indenter", "sphere_7mm", "--png", png)
@@ -251,6 +251,10 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
         (("--parameters", "nowhere.json"), "nowhere.json"),
         (("--at-mm", 40, 0), "no pad"),
         (("--store", "store.h5"), ".sim"),
+        (("--store", f"{__file__}/a.sim"), "no folder"),
+        (("--edge-mm", 0), "edge_m"),
+        (("--edge-mm", 50), "edge_m"),
+        (("--layers", 50), "layers"),
         (("--sweep", "--store", "a.sim", "--depth-mm", 1), "--depth-mm has no effect"),
         (("--path", "press 1 mm", "--steps", 3), "--steps has no effect with --path"),
         (("--poses", "a.csv", "--at-mm", 0, 0), "--at-mm has no effect"),

@@ -26,6 +26,7 @@ from palpate_fem.calibration.result import without_nan
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import (
+    check_folder,
     check_output,
     console,
     print_lines,
@@ -157,6 +158,8 @@ class RunOptions:
                 f"--store {self.store} does not end in {SUFFIX}",
                 remedy=f"call it {self.store.stem}{SUFFIX}",
             )
+        if self.store is not None:
+            check_folder(self.store, "--store")
         if not self.sweep and len(self.indenters) > 1:
             raise ConfigError(
                 "several indenters without --sweep", remedy="add --sweep, or name one"
@@ -186,7 +189,9 @@ class RunOptions:
         """The trajectories to run on a fingertip."""
         skin = skin_of(fingertip)
         if self.sweep:
-            names = tuple(make_indenter(name).name for name in self.indenters) or indenter_names()
+            # An indenter has several names.
+            named = dict.fromkeys(make_indenter(name).name for name in self.indenters)
+            names = tuple(named) or indenter_names()
             return points_first(
                 Campaign(skin, names, self.points, self.seed, self.steps, angled=self.angled)
             )

@@ -70,7 +70,8 @@ class Fingertip:
         """A fingertip that is filled with its fluid.
 
         Args:
-            geometry: Mesh and core.
+            geometry: Mesh and core. The mesh is as thick as it was made: ``skin_thickness_m`` of
+                the parameters is not looked at, give it to the mesh, too.
             parameters: Physical parameters; None = the paper's optimum.
             settings: Tolerances and limits of the solver.
             progress: Called with the fraction done.
@@ -138,7 +139,7 @@ class Fingertip:
             raise SimulationError(
                 f"the unpressurised skin is {low[1] * 1e3:.2f} mm thick already, "
                 f"{wanted * 1e3:.2f} mm are wanted",
-                remedy="raise total_thickness_m or give fluid_volume_m3",
+                remedy="take a thinner skin, or give the fluid (fluid_volume_m3, --fill-ml)",
             )
         begin = low[1]
         # First guess of d thickness / d volume; the BioTac grows by 1.45 mm in 474 mm^3.

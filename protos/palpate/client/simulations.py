@@ -21,6 +21,7 @@ from palpate.errors import (
     PalpateError,
     RemoteError,
     ReplicaDiffers,
+    StreamTimeout,
     WireError,
 )
 from palpate.messages import (
@@ -98,7 +99,8 @@ def ask_simulation(
         RemoteError: It refuses, or cannot go on. Steps that had converged were given to
             ``on_step``.
         ReplicaDiffers: One ended, and another would answer for another fingertip.
-        StreamTimeout: No answer within ``GRACE_S`` after the deadline.
+        StreamTimeout: No answer within ``GRACE_S`` after the deadline, or it was over before a
+            service could be asked.
         WireError: The request, or an answer, breaks the contract.
     """
     check_name(sensor, "sensor")
@@ -115,6 +117,11 @@ def ask_simulation(
             left_s = end_s - time.monotonic()
             if error is not None and (replica is None or left_s <= 0.0):
                 raise error
+            if left_s <= 0.0:
+                raise StreamTimeout(
+                    f"the {deadline_s:g} s were over before a service was asked",
+                    remedy="allow more time",
+                )
             again = dataclasses.replace(request, deadline_s=left_s)
             wait_s = left_s + GRACE_S
             # A service of an older palpate, or one of a name used twice, has no key of its own.
