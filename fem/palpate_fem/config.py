@@ -22,6 +22,9 @@ LIMITS = {
     "strain_stiffening": (1e-6, 0.1),
 }
 
+OPTIONAL = ("fluid_volume_m3", "strain_stiffening")
+"""Parameters that may be None."""
+
 
 @dataclass(frozen=True, slots=True)
 class FingertipParameters:
@@ -54,9 +57,9 @@ class FingertipParameters:
     def __post_init__(self) -> None:
         for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
-            if value is None:
+            if value is None and name in OPTIONAL:
                 continue
-            if not math.isfinite(value) or not low <= value <= high:
+            if value is None or not math.isfinite(value) or not low <= value <= high:
                 raise ConfigError(
                     f"{name} = {value} is not within [{low:g}, {high:g}]",
                     remedy="give it in SI units and within these limits",

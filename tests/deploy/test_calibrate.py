@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import subprocess
 import time
 from collections.abc import Callable
@@ -11,18 +12,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import palpate_training
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig
+from palpate.errors import ConfigError, LinkError
 from palpate.files.bundle import read_bundle
 from palpate.messages import QualityFlag
-from palpate_deploy.station import calibrate
+from palpate_deploy.station import calibrate, guided_presses
 from palpate_deploy.station.guided_presses import HELD_S, PressCounter
+from palpate_services.config import RecorderConfig
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
-from palpate_training.datasets.features import write_dataset
+from palpate_training.datasets.features import of_sensor, write_dataset
 from palpate_training.tasks import finger
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -85,6 +89,79 @@ class TestPresses:
     def test_a_force_about_the_threshold_is_one_press(self) -> None:
         wavering = [(0.1 * k, 0.45 + 0.1 * (k % 2)) for k in range(20)]
         assert count(*wavering, (2.0, 0.0))[0] == 1
+
+
+def test_the_record_is_that_of_its_own_recorder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another station records to the same folder, and ends later."""
+
+    def run(config: RecorderConfig, *_: object, **__: object) -> None:
+        config.out.mkdir(parents=True)
+        (config.out / "lab-1.mcap").write_text("own")
+        (tmp_path / "lab-2.mcap").write_text("another's")
+
+    monkeypatch.setattr(guided_presses, "run_recorder", run)
+    with guided_presses._recording(LinkConfig(), "lab", "finger", tmp_path) as recording:
+        pass
+    assert recording.path() == tmp_path / "lab-1.mcap"
+    assert recording.path().read_text() == "own"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lab-1.mcap", "lab-2.mcap"]
+
+
+def test_a_signal_after_the_presses_ends_the_learning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)]
+
+    def refuse(*_: object, **__: object) -> None:
+        raise LinkError("no router", remedy="start it")
+
+    monkeypatch.setattr(Session, "open", refuse)
+    with pytest.raises(LinkError):
+        guided_presses.record_presses(LinkConfig(), "lab", "finger", 7, tmp_path, Console())
+    assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_a_record_of_another_finger_is_not_learned_from(
+    virtual_record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if the finger had been changed while it was recorded."""
+    monkeypatch.setattr(calibrate, "record_presses", lambda *_, **__: (virtual_record, "BT-7"))
+    order = calibrate.CalibrationOrder("virtual-finger", 7, tmp_path, None, "", serve=False)
+    with pytest.raises(ConfigError, match="'virtual-finger' was BT-7 when it began"):
+        calibrate.calibrate_finger(
+            LinkConfig(), "lab", order, token=None, profile=None, as_json=True
+        )
+
+
+def test_a_data_set_is_of_the_finger_that_is_named(palpate: Palpate, tmp_path: Path) -> None:
+    """Of several fingers one is taken; the finger itself is none of the others."""
+    two = features(read_mixed(SAMPLE))
+    write_dataset(tmp_path / "two.h5", two)
+    write_dataset(tmp_path / "one.h5", of_sensor(two, "biotac-2"))
+    shutil.copy(tmp_path / "one.h5", tmp_path / "copy.h5")
+    (tmp_path / "lab.mcap.part").write_text("cut off")
+
+    def refused(name: str, source: str, *options: str | Path) -> str:
+        done = palpate("calibrate", name, "--from", tmp_path / source, *options, timeout=240)
+        assert done.returncode != 0
+        assert "Traceback" not in done.stderr
+        return " ".join(done.stderr.split())
+
+    for source in ("one.h5", "two.h5"):
+        assert "holds no sensor 'nonsense'" in refused("nonsense", source)
+    for others in ("copy.h5", "two.h5"):
+        said = refused("biotac-2", "one.h5", "--others", tmp_path / others)
+        assert "holds the same presses as" in said
+    twice = ("--others", tmp_path / "one.h5", "--others", tmp_path / "copy.h5")
+    assert "hold the same presses" in refused("biotac-1", "two.h5", *twice)
+    assert "palpate recover" in refused("finger", "lab.mcap.part")
+    said = refused("biotac-2", "one.h5", "--name", "features-twin")
+    assert "features-twin is the name of a bundle that ships" in said
+    done = palpate("calibrate", "biotac-2", "--from", tmp_path / "two.h5", "--json", timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["bundle"] == "features-biotac-2:1"
 
 
 def test_from_presses_to_estimates(

@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from palpate.config import LinkConfig
+from palpate.errors import RecordingError
 from palpate.files.record import read_record
 from palpate_deploy.demo.bundles import write_virtual_record
+from palpate_deploy.diagnose import records
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -99,3 +103,28 @@ def test_virtual_record_is_the_same_again(tmp_path: Path, virtual_record: Path) 
     assert [key for key, _ in first] == [key for key, _ in second]
     wrenches = [[p for k, p in items if k.endswith("wrench")] for items in (first, second)]
     assert wrenches[0] == wrenches[1]
+
+
+def test_record_says_that_its_folder_was_removed(
+    link: LinkConfig,
+    wait_until: Callable[..., None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stop, out = threading.Event(), tmp_path / "runs"
+    monkeypatch.setattr(records, "stop_on_signals", lambda: stop)
+
+    def remove() -> None:
+        try:
+            wait_until(lambda: any(out.glob("*.part")), 60.0, "a record begins")
+            shutil.rmtree(out)
+            wait_until(lambda: any(out.glob("*.part")), 60.0, "another begins")
+        finally:
+            stop.set()
+
+    remover = threading.Thread(target=remove)
+    remover.start()
+    with pytest.raises(RecordingError, match="its file was removed or moved"):
+        records.record_station(link, "lab", {"out": out, "rrd": False}, duration_s=0)
+    remover.join()
+    assert any(out.glob("*.mcap"))

@@ -353,6 +353,13 @@ def test_result_is_a_file_that_gives_the_parameters_back(tmp_path: Path) -> None
     assert len(content["history"]) == len(found.history)
     plot_calibration(found, picture)
     assert picture.read_bytes().startswith(b"\x89PNG")
+    content["parameters"] |= {"strain_stiffening": None, "fluid_volume_m3": None}
+    path.write_text(json.dumps(content))
+    assert read_parameters(path).fluid_volume_m3 is None
+    content["parameters"]["shear_modulus_pa"] = None
+    path.write_text(json.dumps(content))
+    with pytest.raises(ConfigError, match="shear_modulus_pa = None"):
+        read_parameters(path)
     path.write_text(path.read_text().replace("palpate.calibration", "other"))
     for bad in (path, tmp_path / "nothing.json", picture):
         with pytest.raises(ConfigError, match="not a calibration"):

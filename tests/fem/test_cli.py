@@ -22,7 +22,7 @@ from typer.testing import CliRunner, Result
 from palpate.client import Client
 from palpate.client.simulations import straight_path
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, LinkError, MissingExtraError, PalpateError
+from palpate.errors import ConfigError, DatasetError, LinkError, MissingExtraError, PalpateError
 from palpate.messages import SimulationOutcome, SimulationParameters, SimulationRequest
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation, write_indentations
 from palpate_fem.calibration.result import read_parameters
@@ -167,7 +167,7 @@ def test_the_bench_tells_times_and_rates_of_the_solver() -> None:
 def test_a_sweep_is_resumed_and_drawn(tmp_path: Path) -> None:
     store, png = tmp_path / "a.sim", tmp_path / "a.png"
     words = ("run", "--sweep", "--points", 1, "--steps", 3, "--store", store, "--workers", 2)
-    done = fem(*words, "--indenter", "cube", "--indenter", "ring")
+    done = fem(*words, "--indenter", "cube", "--indenter", "ring", "--indenter", "cube_14mm")
     assert done.exit_code == 0
     assert "10 of 10 run: 10 complete" in done.stdout
     done = fem(*words, "--indenter", "cube", "--indenter", "sphere_7mm", "--png", png)
@@ -182,6 +182,38 @@ def test_one_press_into_a_store_is_run_once(tmp_path: Path) -> None:
     again = fem(*words)
     assert "1 were there already" in again.stdout
     assert "complete" in again.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "kind", "code"),
+    [
+        (("--steps", 3), "DIVERGES", 1),
+        (("--steps", 3), "PINCHES", 0),
+        (("--sweep", "--points", 1, "--angled", 0, "--indenter", "cube"), "DIVERGES", 1),
+    ],
+)
+def test_what_failed_before_fails_the_same_command(
+    tmp_path: Path, words: tuple[object, ...], kind: str, code: int
+) -> None:
+    store, friction = tmp_path / "a.sim", getattr(fakes, kind)
+    for run in ("1 of 1 run", "0 of 0 run; 1 were there already"):
+        done = fem("run", *words, "--store", store, friction=friction)
+        assert run in done.stdout
+        assert done.exit_code == code
+    assert ("of which 1 did not complete" in done.stdout) is (code == 1)
+
+
+def test_a_store_keeps_stress_of_all_or_of_none(tmp_path: Path) -> None:
+    with_stress, without = tmp_path / "with.sim", tmp_path / "without.sim"
+    assert fem("run", "--steps", 3, "--store", with_stress, "--stress").exit_code == 0
+    assert fem("run", "--steps", 3, "--store", without).exit_code == 0
+    for steps in (3, 4):
+        with pytest.raises(DatasetError, match="without stress") as caught:
+            fem("run", "--steps", steps, "--store", without, "--stress")
+    assert "leave out --stress" in caught.value.remedy
+    with pytest.raises(DatasetError, match="with stress"):
+        fem("run", "--steps", 4, "--store", with_stress)
+    assert fem("run", "--steps", 4, "--store", with_stress, "--stress").exit_code == 0
 
 
 @pytest.mark.parametrize(
@@ -219,11 +251,16 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
         (("--parameters", "nowhere.json"), "nowhere.json"),
         (("--at-mm", 40, 0), "no pad"),
         (("--store", "store.h5"), ".sim"),
+        (("--store", f"{__file__}/a.sim"), "no folder"),
+        (("--edge-mm", 0), "edge_m"),
+        (("--edge-mm", 50), "edge_m"),
+        (("--layers", 50), "layers"),
         (("--sweep", "--store", "a.sim", "--depth-mm", 1), "--depth-mm has no effect"),
         (("--path", "press 1 mm", "--steps", 3), "--steps has no effect with --path"),
         (("--poses", "a.csv", "--at-mm", 0, 0), "--at-mm has no effect"),
         (("--seed", 3), "--seed has no effect with a single press"),
         (("--stress",), "--store"),
+        (("--png", "measured.h5"), ".png"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(words: tuple[object, ...], said: str) -> None:
@@ -271,6 +308,59 @@ def test_calibrate_then_validate(measured: Path, tmp_path: Path) -> None:
     assert json.loads((out / "validation.json").read_text())["median_n"] < 0.05
     with pytest.raises(ConfigError, match="begins with ring"):
         fem("validate", measured, "--only", "ring")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("calibrate", "measured.h5", "--out", "measured.h5"), ".json"),
+        (("calibrate", "measured.h5", "--png", "measured.h5"), ".png"),
+        (("calibrate", "linked.json", "--out", "linked.json"), "reads"),
+        (("calibrate", "linked.json", "--out", "./again.json"), "reads"),
+        (("calibrate", "measured.h5", "--out", "folder.json"), "is a folder"),
+        (("calibrate", "measured.h5", "--png", "folder.png"), "is a folder"),
+        (("calibrate", "measured.h5", "--out", "measured.h5/fit.json"), "no folder"),
+        (("validate", "measured.h5", "--out", "measured.h5"), "no folder"),
+        (("units", "draw", 2, "--out", "measured.h5"), ".json"),
+        (("units", "fit", "a.sim", "--out", "measured.h5"), ".json"),
+        (("units", "fit", "a.sim", "--recording", "b.h5", "--out", "b.h5"), ".json"),
+        (("study", "mesh", "--png", "measured.h5"), ".png"),
+    ],
+)
+def test_what_would_replace_another_file_is_refused_at_once(
+    measured: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...], said: str
+) -> None:
+    monkeypatch.chdir(measured.parent)
+    before = measured.read_bytes()
+    Path("folder.json").mkdir()
+    Path("folder.png").mkdir()
+    for name in ("linked.json", "again.json"):
+        Path(name).symlink_to(measured)
+    with pytest.raises(ConfigError, match=said):
+        fem(*words)
+    assert measured.read_bytes() == before
+
+
+def test_what_was_found_is_told_though_the_disk_refuses(
+    measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise DatasetError("no space", remedy="free some")
+
+    monkeypatch.setattr("palpate_fem.cli.identify.write_calibration", refuse)
+    words = ["calibrate", str(measured), "--out", str(tmp_path / "fit.json"), "--workers", "2"]
+    done = CliRunner().invoke(fem_app, words)
+    assert isinstance(done.exception, DatasetError)
+    assert "shear_modulus_pa" in done.stdout
+    assert "wrote" not in done.stdout
+
+
+@pytest.mark.parametrize(
+    "words", [("--edge-mm", 0.9), ("--layers", 1), ("--parameters", "a.json"), ("--mesh", "biotac")]
+)
+def test_a_store_is_compared_as_it_is(words: tuple[object, ...]) -> None:
+    with pytest.raises(ConfigError, match=f"{words[0]} has no effect with --store"):
+        fem("validate", "measured.h5", "--store", "a.sim", *words)
 
 
 def test_a_missing_extra_gives_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -364,6 +454,30 @@ def test_serve_answers_until_it_is_told_to_stop(link: LinkConfig) -> None:
     finally:
         process.kill()
         process.wait()
+
+
+def test_each_serve_answers_for_its_own_sensor(link: LinkConfig) -> None:
+    common = ("serve", "--connect", link.connect[0], "--workers", 1)
+    processes = [
+        spawn(*common, "--sensor", sensor, "--shear-modulus-kpa", modulus)
+        for sensor, modulus in (("soft", 100), ("hard", 1000))
+    ]
+    try:
+        with Client(link.connect[0], timeout_s=5) as robot:
+            deadline = time.monotonic() + PATIENCE_S
+            while sum(process.ready for process in robot.alive()) < 2:
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+            assert len({process.instance for process in robot.alive()}) == 2
+            soft, hard = (
+                robot.simulate(fakes.request(sensor), sensor=sensor).steps[-1].force[2]
+                for sensor in ("soft", "hard")
+            )
+            assert hard == pytest.approx(10.0 * soft)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 def test_serve_without_a_router(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:

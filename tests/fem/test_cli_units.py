@@ -31,6 +31,16 @@ def test_what_cannot_be_fitted_or_shown_is_refused(tmp_path: Path) -> None:
         (["units", "show", str(tmp_path / "no.json")], ConfigError, "no.json"),
         (["units", "fit", str(tmp_path / "no.sim"), "--out", "x.json"], DatasetError, "no.sim"),
         (
+            ["units", "fit", "a.sim", "--out", "x.json", "--touches", "3"],
+            ConfigError,
+            "--touches has no effect without --recording",
+        ),
+        (
+            ["units", "fit", "a", "--recording=a.h5", "--out", "x.json", "--overtravel-mm", "1"],
+            ConfigError,
+            "--overtravel-mm has no effect with --recording",
+        ),
+        (
             ["units", "fit", str(tmp_path), "--out", "x.json", "--overtravel-mm", "-1"],
             ConfigError,
             "overtravel",

@@ -16,6 +16,7 @@ from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.indenter.distance import distance
 from palpate_fem.mechanics.iteration import NewtonSettings
 from palpate_fem.mechanics.load_stepping import VOIGT, LoadStepping, SolverSettings
+from palpate_fem.mechanics.newton import NewtonSolver
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.core import RigidCore
 from palpate_fem.mesh.solid import FingertipGeometry, SolidMesh
@@ -343,14 +344,16 @@ def held_at_rest(finger: Fingertip) -> float:
     return float(cavity(mesh.inner_faces, mesh.nodes).volume.sum()) - finger.core_volume
 
 
-def test_a_fill_that_sucks_the_skin_inwards_is_refused(finger: Fingertip, fill: Fill) -> None:
+def test_a_fill_that_sucks_the_skin_inwards_is_refused_unsolved(
+    finger: Fingertip, fill: Fill, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rest = held_at_rest(finger)
     assert 0.0 <= fill(fluid_volume_m3=rest + 1e-12).fluid_pressure_pa < 50.0
+    # Solving would take longer than a caller may wait, only to refuse it.
+    monkeypatch.setattr(NewtonSolver, "solve", None)
     for less in (0.5e-9, 3e-9):
         with pytest.raises(SimulationError, match="suck the skin inwards") as caught:
             fill(fluid_volume_m3=rest - less)
-        pressure = float(caught.value.problem.split()[-2])
-        assert -20.0 < pressure <= -0.01
         assert f"{(rest - less) * 1e6:.3f} ml" in caught.value.problem
         named = float(caught.value.remedy.split()[4])  # fill in at least X ml
         assert named * 1e-6 == pytest.approx(rest, abs=1e-9)

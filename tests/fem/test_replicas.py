@@ -53,6 +53,10 @@ def holders(session: Session) -> list[str]:
     return [one.instance for one in session.holders(duty_root("simulate"), "twin")]
 
 
+def held_by_any(session: Session) -> list[Any]:
+    return session.holders(duty_root("simulate"), "*")
+
+
 @contextlib.contextmanager
 def child(link: LinkConfig, instance: str) -> Iterator[subprocess.Popen[bytes]]:
     """A replica in a process of its own, which can be killed and stopped."""
@@ -238,6 +242,59 @@ def test_a_replica_with_other_parameters_does_not_answer(own_bus: LinkConfig) ->
         until(lambda: (found := other()) and found.state is ServiceState.READY)
         robot.simulate(fakes.request("the other"), timeout_s=PATIENCE_S)
         assert other().counters.get("requests_received") == 1
+
+
+def test_options_at_their_defaults_are_no_difference(own_bus: LinkConfig) -> None:
+    with (
+        thread(own_bus, "fem-a"),
+        thread(own_bus, "fem-b", options={"fill_s": 0.0}),
+        Client(own_bus.connect[0], timeout_s=10) as robot,
+    ):
+        until(lambda: holders(robot.session) == ["fem-a", "fem-b"])
+
+
+def test_who_may_not_answer_says_so_once(own_bus: LinkConfig) -> None:
+    stop, told = threading.Event(), []
+    values = {**FAKES, "fingertip": {"shear_modulus_pa": 3.0e5}}
+    with (
+        thread(own_bus, "fem-a"),
+        Client(own_bus.connect[0], timeout_s=10) as robot,
+    ):
+        until(lambda: holders(robot.session) == ["fem-a"])
+        other = threading.Thread(
+            target=node.run,
+            args=(parse_config(FemConfig, values, where="test"), own_bus, "lab", stop),
+            kwargs={"instance": "fem-b", "on_refusal": told.append},
+        )
+        other.start()
+        try:
+            until(lambda: told)
+            until(lambda: any(one.state is ServiceState.DEGRADED for one in robot.status()))
+        finally:
+            stop.set()
+            other.join(PATIENCE_S)
+    (refusal,) = told
+    assert "would answer otherwise" in refusal.problem
+
+
+def test_services_of_one_name_answer_for_their_own_sensors(own_bus: LinkConfig) -> None:
+    round_finger = {"factory": "fem_fakes:round_finger", "waiting": 2}
+    with (
+        thread(own_bus, "fem", sensor="soft", fingertip={"shear_modulus_pa": 1e5}, **round_finger),
+        thread(own_bus, "fem", sensor="hard", fingertip={"shear_modulus_pa": 1e6}, **round_finger),
+        Client(own_bus.connect[0], timeout_s=10) as robot,
+    ):
+        until(lambda: {one.sensor for one in held_by_any(robot.session)} == {"soft", "hard"})
+        for number in range(5):
+            force = {
+                sensor: robot.simulate(
+                    fakes.request(f"{sensor} {number}"), sensor=sensor, timeout_s=PATIENCE_S
+                )
+                .steps[-1]
+                .force[2]
+                for sensor in ("soft", "hard")
+            }
+            assert force["hard"] == pytest.approx(10.0 * force["soft"])
 
 
 def test_many_may_ask_in_the_same_instant(

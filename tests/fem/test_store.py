@@ -189,6 +189,17 @@ def test_another_fingertip_is_refused(
     StoreWriter(path, same).close()
 
 
+def test_trajectories_without_their_fingertip_are_not_adopted(
+    path: Path, tip: StoredFingertip
+) -> None:
+    (path / "fingertip.h5").unlink()
+    other = replace(tip, parameters=replace(tip.parameters, shear_modulus_pa=1e5))
+    with pytest.raises(StoreMismatchError, match=r"fingertip\.h5"):
+        StoreWriter(path, other)
+    StoreWriter(path, tip).close()  # its own fingertip is written again
+    assert SimulationStore.open(path).check() == 2
+
+
 @pytest.mark.parametrize(
     "name", ["", "/a", "a/", "a//b", "../a", "a/../b", ".hidden", "a b", "ä", "a\n", "x" * 201]
 )

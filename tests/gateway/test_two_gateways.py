@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 
-from palpate.bus import Session
+from palpate.bus import Session, endpoints
 from palpate.bus.topics import ELECTRODES
 from palpate.codec import ELECTRODE_FRAME
 from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, StreamTimeout
-from palpate.messages import ElectrodeFrame, SensorState, ServiceState, Status
+from palpate.messages import ElectrodeFrame, SensorState, ServiceState, Status, TareRequest
 
 PATIENCE_S = 20.0
 
@@ -105,6 +105,11 @@ def test_the_second_is_refused_and_takes_over(bus: Any) -> None:
         assert {frame.stamp.session_id for frame in take(frames, 100)} == {one.stamp.session_id}
         ready = bus.until(lambda: [a.instance for a in bus.session.alive() if a.ready])
         assert ready == ["gateway"]
+        # Of two that answer, either might be asked.
+        tares = bus.session.query_all(
+            endpoints.TARE, TareRequest(frames=10), sensor="finger", timeout_s=PATIENCE_S
+        )
+        assert [tare.stamp.session_id for tare in tares] == [one.stamp.session_id]
         first.stop.set()
         first.thread.join(PATIENCE_S)
         assert next_of_another(frames, one.stamp.session_id).stamp.sequence == 1

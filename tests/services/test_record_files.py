@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -187,6 +188,70 @@ def test_too_little_space_is_reported_and_recording_resumes(
     records = sorted((tmp_path / "runs").iterdir())
     assert [[item.sequence for item in read_record(r)] for r in records] == [[1], [3]]
     assert all(record.suffix == ".mcap" for record in records)
+
+
+@pytest.mark.parametrize("how", ["part", "replaced", "folder", "emptied", "moved", "file"])
+def test_record_whose_file_is_taken_away_is_told_and_a_new_one_begun(
+    how: str,
+    open_files: Any,
+    sample: Callable[[int], TapSample],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
+    monkeypatch.setattr(writer_module, "RETRY_S", 0.0)
+    runs = tmp_path / "runs"
+    with open_files() as (files, health):
+        for sequence in range(1, 6):
+            files.write(sample(sequence))
+        (part,) = runs.glob("*.part")
+        if how in ("part", "replaced"):
+            part.unlink()
+        elif how == "moved":
+            runs.rename(tmp_path / "elsewhere")
+        else:
+            shutil.rmtree(runs)
+        if how == "replaced":
+            part.write_bytes(b"another file")
+        if how == "emptied":
+            runs.mkdir()
+        if how == "file":
+            runs.write_bytes(b"no folder")
+        files.tick()
+        status = health.status()
+        assert status.state is ServiceState.DEGRADED
+        assert status.last_error is not None
+        if how == "file":
+            assert str(runs) in status.last_error.message
+            runs.unlink()
+            files.tick()
+        else:
+            assert str(part) in status.last_error.message
+            assert "free" not in status.last_error.remedy
+        files.write(sample(6))
+    (record,) = runs.glob("*.mcap")
+    assert [item.sequence for item in read_record(record)] == [6]
+    assert health.counters["records_gone"] == 1
+    assert health.counters["lost_with_record"] == (0 if how == "moved" else 5)
+    assert "lost_disk_full" not in health.counters
+    if how == "moved":
+        (found,) = recover_all([tmp_path / "elsewhere" / part.name])
+        assert [item.sequence for item in read_record(found.path)] == [1, 2, 3, 4, 5]
+    if how == "replaced":
+        assert part.read_bytes() == b"another file"
+
+
+def test_record_that_is_gone_at_its_end_is_counted(
+    open_files: Any, sample: Callable[[int], TapSample], tmp_path: Path
+) -> None:
+    with open_files() as (files, health):
+        files.write(sample(1))
+        (part,) = (tmp_path / "runs").glob("*.part")
+        part.unlink()
+        part.write_bytes(b"another file")
+    assert health.state is ServiceState.DEGRADED
+    assert health.counters["lost_with_record"] == 1
+    assert list((tmp_path / "runs").iterdir()) == [part]
 
 
 def test_each_full_disk_is_told_once_whatever_else_is_wrong(

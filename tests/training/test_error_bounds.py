@@ -232,8 +232,17 @@ def test_what_cannot_calibrate_is_refused(
     press_data: MakeData, trained: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "2"
-    with pytest.raises(DatasetError, match="was trained on one of"):
+    with pytest.raises(DatasetError, match="was trained on presses of"):
         add_intervals(trained, [tmp_path / "train.h5"], out)
+    # The same rows with other numbers of presses, as they come back from a table.
+    seen = press_data(presses=30)
+    renumbered = replace(seen, group=29 - seen.group, block=29 - seen.block)
+    write_dataset(tmp_path / "again.h5", renumbered)
+    with pytest.raises(DatasetError, match=r"was trained on presses of .*again\.h5"):
+        add_intervals(trained, [tmp_path / "again.h5"], out)
+    write_dataset(tmp_path / "half.h5", press_data(presses=PRESSES_LEAST // 2, seed=1))
+    with pytest.raises(DatasetError, match="hold the same presses"):
+        add_intervals(trained, [tmp_path / "half.h5", tmp_path / "half.h5"], out)
     write_dataset(tmp_path / "few.h5", press_data(presses=PRESSES_LEAST - 1, seed=1))
     with pytest.raises(DatasetError, match=f"{PRESSES_LEAST} are needed"):
         add_intervals(trained, [tmp_path / "few.h5"], out)

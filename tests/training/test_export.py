@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -205,6 +206,15 @@ def test_one_tested_press_tells_nothing_of_how_sure_its_error_is(
     metrics = read_bundle(tmp_path / "bundle").manifest.metrics
     assert "force_magnitude_median_n" in metrics
     assert not [name for name in metrics if "ci95" in name]
+
+
+def test_blocks_of_a_single_group_are_its_presses(press_data: MakeData, tmp_path: Path) -> None:
+    data = press_data(presses=12)
+    write_dataset(tmp_path / "one.h5", replace(data, group=np.zeros_like(data.group)))
+    train_features(tmp_path / "one.h5", tmp_path / "bundle", config=QUICK)
+    manifest = read_bundle(tmp_path / "bundle").manifest
+    assert "of 9 presses; tested on 2 other presses" in manifest.trained_on
+    assert "force_magnitude_median_ci95_low_n" in manifest.metrics
 
 
 def test_too_few_presses_are_named(press_data: MakeData, tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from palpate_training.cli import data_app
 from palpate_training.datasets.basis import fit_basis, subset
 from palpate_training.datasets.experiment import MixedDataset, read_mixed, write_mixed
 from palpate_training.datasets.features import FeatureDataset, joined
-from palpate_training.datasets.join import join_mixed
+from palpate_training.datasets.join import join_files, join_mixed
+from palpate_training.datasets.shrink import SmallSize, shrink_file
 
 
 def other_skin(data: MixedDataset) -> MixedDataset:
@@ -81,9 +82,10 @@ def test_parts_that_do_not_fit_together_are_refused(large: MixedDataset, tmp_pat
         join_mixed([large, replace(large, experiment=own)], ["a", "b"], modes=2, force_modes=1)
 
     files = [tmp_path / folder / "mixed.h5" for folder in ("one", "two")]
-    for file in files:
+    unlike = replace(large.experiment, tared=large.experiment.tared * np.float32(1.1))
+    for file, one in zip(files, (large, replace(large, experiment=unlike)), strict=True):
         file.parent.mkdir()
-        write_mixed(file, large)
+        write_mixed(file, one)
     out, command = tmp_path / "both.h5", ["join", *map(str, files)]
     twice = CliRunner().invoke(data_app, [*command, str(files[0]), str(out)])
     assert isinstance(twice.exception, DatasetError)
@@ -114,3 +116,14 @@ def test_joined_features_keep_presses_apart(press_data: Callable[..., FeatureDat
     paid = replace(other, provenance=replace(other.provenance, licence="other"))
     with pytest.raises(DatasetError, match="licences differ"):
         joined([one, paid])
+    with pytest.raises(DatasetError, match="hold the same presses: "):
+        joined([one, other, replace(one, sensor_names=("third",))])
+
+
+def test_a_part_and_what_it_is_of_are_not_joined(large: MixedDataset, tmp_path: Path) -> None:
+    write_mixed(tmp_path / "whole.h5", large)
+    shrink_file(tmp_path / "whole.h5", tmp_path / "few.h5", SmallSize(4, 3, 2, 2), command="")
+    paths = [tmp_path / "whole.h5", tmp_path / "few.h5"]
+    with pytest.raises(DatasetError, match="hold the same presses"):
+        join_files(paths, tmp_path / "both.h5", modes=2, force_modes=2, command="")
+    assert not (tmp_path / "both.h5").exists()

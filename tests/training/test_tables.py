@@ -116,6 +116,16 @@ def test_without_groups_a_file_is_cut_into_blocks(data: FeatureDataset) -> None:
         (lambda rows: put(rows, "electrode_3", float("nan")), "electrodes is not known in row 4"),
         (lambda rows: put(rows, "force_z_n", float("inf")), "force is not known in row 4"),
         (lambda rows: put(rows, "in_contact", 3.0), "'in_contact' holds 3 in row 4"),
+        (lambda rows: put(rows, "in_contact", None), "in_contact is not known in row 4"),
+        (lambda rows: put(rows, "group", None), "group is not known in row 4"),
+        (lambda rows: put(rows, "group", float("nan")), "group is not known in row 4"),
+        (lambda rows: put(rows, "sensor", " "), "sensor is not known in row 4"),
+        (lambda rows: lack(rows, "time_ns"), "time_ns is not known in row 4"),
+        (lambda rows: put(rows, "time_ns", 0.0), "row 4 is earlier than the one before it"),
+        (
+            lambda rows: rows.append_column("force_x_n", rows["force_x_n"]),
+            "several columns 'force_x_n'",
+        ),
         (lambda rows: put(rows, "force_x_n", "much"), "'force_x_n' holds string"),
         (lambda rows: rows.slice(0, 0), "no rows"),
     ],
@@ -124,6 +134,14 @@ def test_a_wrong_table_is_refused(data: FeatureDataset, change: object, says: st
     table = change(table_of(data))  # type: ignore[operator]
     with pytest.raises(DatasetError, match=says):
         dataset_of(table, ColumnMap.ours(table.column_names), source=Path("lab.csv"))
+
+
+def lack(table: pa.Table, name: str) -> pa.Table:
+    """A table without the value in row 4 of one column, of the same type."""
+    values = table.column(name).to_pylist()
+    values[4] = None
+    kind = table.schema.field(name).type
+    return table.set_column(table.column_names.index(name), name, pa.array(values, kind))
 
 
 def put(table: pa.Table, name: str, value: object) -> pa.Table:
@@ -144,6 +162,22 @@ def test_incomplete_rows_are_left_out_only_if_that_is_said(data: FeatureDataset)
     )
     assert len(found) == len(data) - 1
     assert "1 incomplete rows left out" in found.provenance.notes
+    for name in ("time_ns", "sensor", "group", "in_contact"):
+        lacking = lack(table_of(data), name)
+        columns = ColumnMap.ours(lacking.column_names)
+        found = dataset_of(lacking, columns, source=Path("x"), drop_incomplete=True)
+        assert len(found) == len(data) - 1
+        assert found.sensor_names == data.sensor_names
+        np.testing.assert_array_equal(found.time_ns, np.delete(data.time_ns, 4))
+
+
+def test_errors_count_rows_of_the_table(data: FeatureDataset) -> None:
+    """Also where earlier ones were left out."""
+    table = put(table_of(data), "electrode_3", 17.5)
+    table = table.set_column(0, "electrode_1", pa.array([None, *data.electrodes[1:, 0]]))
+    columns = ColumnMap.ours(table.column_names)
+    with pytest.raises(DatasetError, match=r"E3 reads 17\.5 in row 4"):
+        dataset_of(table, columns, source=Path("x"), drop_incomplete=True)
 
 
 def test_lists_of_another_width_are_refused(data: FeatureDataset) -> None:

@@ -48,6 +48,20 @@ def test_a_common_offset_changes_nothing_and_a_mirror_image_mirrors() -> None:
     np.testing.assert_allclose(there, plain * MIRROR_AXES, atol=1e-4)
 
 
+def test_it_replaces_nothing_else(data: FeatureDataset, tmp_path: Path) -> None:
+    rows, notes = tmp_path / "rows.h5", tmp_path / "notes.json"
+    write_dataset(rows, data)
+    notes.write_text("{}")
+    for out, problem in ((rows, "written as JSON"), (notes, "exists and is no line")):
+        before = out.read_bytes()
+        result = CliRunner().invoke(train_app, ["line", str(rows), str(out)])
+        assert isinstance(result.exception, DatasetError)
+        assert problem in str(result.exception)
+        assert out.read_bytes() == before
+    write_line(tmp_path / "line.json", fit_line(data))
+    write_line(tmp_path / "line.json", fit_line(data))
+
+
 def test_it_is_kept_and_read_again(data: FeatureDataset, tmp_path: Path) -> None:
     write_dataset(tmp_path / "rows.h5", data)
     arguments = ["line", str(tmp_path / "rows.h5"), str(tmp_path / "line.json")]

@@ -20,8 +20,9 @@ from palpate.bus import Session
 from palpate.bus.query import LONGEST_S
 from palpate.bus.topics import parse_key
 from palpate.config import LinkConfig, check_duration, parse_config
-from palpate.errors import ConfigError, LinkError, printable
+from palpate.errors import ConfigError, LinkError, RecordingError, printable
 from palpate.files.record import RecordSummary, check_readable, recover, summarise
+from palpate.health import Health
 from palpate.process import stop_on_signals
 from palpate_deploy.station.logs import cell
 from palpate_deploy.station.status import duration_text
@@ -49,13 +50,13 @@ def record_station(
         LinkError: There is no router, or nothing came of the station or of the sensor that is
             named; the record is there, though.
         ConfigError: An unknown topic, or no duration.
-        RecordingError: The folder cannot be made.
+        RecordingError: The folder cannot be made, or a record was removed or moved meanwhile.
     """
     from palpate_services.config import EVERYTHING, RecorderConfig
 
     if duration_s:
         check_duration(duration_s, "--duration-s", most=LONGEST_S)
-    from palpate_services.recorder.service import run_recorder
+    from palpate_services.recorder.service import SERVICE, run_recorder
 
     config = parse_config(RecorderConfig, {**EVERYTHING, **settings}, where="command line")
     Session.open(link, station=station).close()  # raises at once if there is no router
@@ -68,10 +69,17 @@ def record_station(
     until = f"for {duration_s:g} s" if duration_s else "until Ctrl-C"
     print(f"recording station {station} to {config.out}/ {until}", flush=True)
     instance = f"record-{os.getpid()}"
-    own = f"recorder/{instance}"
-    run_recorder(config, link, station, stop, instance=instance)
+    own = f"{SERVICE}/{instance}"
+    health = Health(SERVICE, instance)
+    run_recorder(config, link, station, stop, instance=instance, health=health)
     written = sorted(set(config.out.glob("*.mcap")) - before)
     keys = [parse_key(key) for path in written for key in print_contents(path).counts]
+    if health.counters.get("records_gone"):
+        raise RecordingError(
+            "the record is not whole: its file was removed or moved while it was written, "
+            f"{health.counters.get('lost_with_record', 0):,} messages are lost",
+            remedy="record again, and leave the folder alone until it ends",
+        )
     if config.sensor != "*" and not any(key.sensor == config.sensor for key in keys):
         raise LinkError(
             f"nothing came of sensor {config.sensor!r}",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +29,7 @@ from palpate.process import check_installed
 from palpate_deploy.station.guided_presses import record_presses, untouched
 from palpate_deploy.station.profile import Profile
 from palpate_services.config import ModelsConfig
-from palpate_services.inference.repository import Repository
+from palpate_services.inference.repository import Repository, available
 from palpate_training import EXTRA_MODULES
 
 if TYPE_CHECKING:
@@ -93,10 +93,12 @@ class _Others:
     Attributes:
         fingers: Their presses.
         serials: The serial numbers that are known of them, and where each was found.
+        digests: Of their rows, and likewise: the same rows may have another name.
     """
 
     fingers: list[OtherFinger]
     serials: dict[str, Path]
+    digests: dict[str, Path]
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> _Others:
@@ -105,16 +107,38 @@ class _Others:
         Raises:
             RecordingError: A record is damaged.
             DatasetError: A file is no data set, or holds too few presses of a finger.
+            ConfigError: Two files hold the same presses.
         """
         from palpate_training.tasks.other_fingers import fingers_in
 
         fingers: list[OtherFinger] = []
         serials: dict[str, Path] = {}
+        digests: dict[str, Path] = {}
         for path in paths:
             data, own = _rows(path)
             fingers += fingers_in(data)
             serials |= dict.fromkeys(own, path)
-        return cls(fingers, serials)
+            for digest in _digests(data):
+                if (first := digests.setdefault(digest, path)) is not path:
+                    raise ConfigError(
+                        f"{first} and {path} hold the same presses",
+                        remedy="name each finger's presses once",
+                    )
+        return cls(fingers, serials, digests)
+
+    def check_rows(self, data: FeatureDataset) -> None:
+        """Refuse presses that are among the others.
+
+        Raises:
+            ConfigError: They are.
+        """
+        for digest in _digests(data):
+            if digest in self.digests:
+                raise ConfigError(
+                    f"{self.digests[digest]} holds the same presses as {data.name}, the finger"
+                    " itself",
+                    remedy="leave it out of --others; --from learns from it",
+                )
 
     def check(self, serial: str) -> None:
         """Refuse a finger that is among the others; an unknown serial number is none.
@@ -154,6 +178,8 @@ def calibrate_finger(
     kept = ModelsConfig() if profile is None else profile.models
     # Before the presses: nobody wants to press twenty times for a bundle that cannot be made, or
     # not be served.
+    if order.name:
+        _check_not_shipped(order.name)
     others = _Others.read(order.others)
     secret = b""
     if order.serve:
@@ -167,14 +193,22 @@ def calibrate_finger(
         rest = tare.electrodes.astype(np.float64)
         report = _learn_unpressed(rest, others.fingers, new, console)
     else:
+        live = ""
         if source is None:
-            source = record_presses(
+            source, live = record_presses(
                 *(link, station, order.sensor, order.presses, order.out, console),
                 check=others.check,
             )
         data, serials = _rows(source, order.sensor)
+        if live and serials != [live]:
+            raise ConfigError(
+                f"{source} is of {', '.join(serials) or 'no known finger'}, {order.sensor!r} was"
+                f" {live} when it began",
+                remedy="press it again, without changing the finger meanwhile",
+            )
         for serial in serials:
             others.check(serial)
+        others.check_rows(data)
         new = _NewBundle.of(order, serials, kept.repository_folder)
         report = _learn(data, serials, others.fingers, new, console)
     label = f"{new.name}:{new.version}"
@@ -207,21 +241,50 @@ def calibrate_finger(
 
 def _rows(source: Path, sensor: str | None = None) -> tuple[FeatureDataset, list[str]]:
     """Rows of a record or data set, of one finger or all; serial numbers where they are known."""
-    from palpate_training.datasets.features import open_dataset
+    from palpate_training.datasets.features import of_sensor, open_dataset
     from palpate_training.datasets.ingest import read_streams, rows_of_streams
 
-    if source.suffix != ".mcap":
-        return open_dataset(source), []
-    streams = read_streams(source)
-    if sensor is not None:
-        if sensor not in streams:
+    def check(held: Collection[str]) -> None:
+        if sensor is not None and sensor not in held:
             raise ConfigError(
                 f"{source} holds no sensor {sensor!r}",
-                remedy=f"it holds: {', '.join(sorted(streams)) or 'none'}",
+                remedy=f"it holds: {', '.join(sorted(held)) or 'none'}",
             )
+
+    if source.suffix == ".part":
+        raise ConfigError(
+            f"{source} is a record that was not finished", remedy=f"palpate recover {source}"
+        )
+    if source.suffix != ".mcap":
+        data = open_dataset(source)
+        check(data.sensor_names)
+        return data if sensor is None else of_sensor(data, sensor), []
+    streams = read_streams(source)
+    check(streams)
+    if sensor is not None:
         streams = {sensor: streams[sensor]}
     frames = (frame for each in streams.values() for frame in each.frames)
     return rows_of_streams(source, streams), sorted({f.sensor_serial for f in frames} - {""})
+
+
+def _digests(data: FeatureDataset) -> list[str]:
+    """Digest of the rows of each finger, whatever it is called."""
+    from palpate_training.evaluation.transfer import fingers_of
+
+    return [finger.digest for finger in fingers_of(data)]
+
+
+def _check_not_shipped(name: str) -> None:
+    """Refuse the name of a bundle that ships: a station would take one finger's for newer.
+
+    Raises:
+        ConfigError: It is one.
+    """
+    if name in {label.partition(":")[0] for label in available()}:
+        raise ConfigError(
+            f"{name} is the name of a bundle that ships with palpate",
+            remedy="give the finger's own another one: --name NAME",
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +299,7 @@ class _NewBundle:
     def of(cls, order: CalibrationOrder, serials: Sequence[str], repository: Path) -> _NewBundle:
         """That of a finger with these serial numbers."""
         name = order.name or f"features-{_plain(serials[0] if serials else order.sensor)}"
+        _check_not_shipped(name)
         known = [label.partition(":") for label in Repository(repository).available()]
         version = 1 + max((int(number) for other, _, number in known if other == name), default=0)
         return cls(name, version, repository / name / str(version))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -109,8 +110,8 @@ def record_presses(
     console: Console,
     *,
     check: Callable[[str], None] = lambda _: None,
-) -> Path:
-    """Guide through so many presses while they are recorded; the record.
+) -> tuple[Path, str]:
+    """Guide through so many presses while they are recorded; the record, and the serial number.
 
     Ctrl-C ends before the last press; what was recorded then is learned from.
 
@@ -129,9 +130,9 @@ def record_presses(
         StreamTimeout: A stream ends, or the finger is not let go.
         RecordingError: The record cannot be written.
     """
-    interrupted = stop_on_signals()
-    with Session.open(link, station=station) as session:
-        check(_first(session, ELECTRODES, sensor, _NO_ELECTRODES).sensor_serial)
+    with _until_recorded() as interrupted, Session.open(link, station=station) as session:
+        serial = _first(session, ELECTRODES, sensor, _NO_ELECTRODES).sensor_serial
+        check(serial)
         no_force = f'give the force/torque sensor of = "{sensor}" in the profile'
         _first(session, WRENCH, sensor, no_force)
         with _recording(link, station, sensor, out) as recording:
@@ -139,7 +140,19 @@ def record_presses(
             tare_at_rest(session, sensor, interrupted, again_s=_AGAIN_S)
             if not interrupted.is_set():
                 _guide(session, sensor, presses, out, interrupted, console, check=recording.check)
-        return recording.path()
+        return recording.path(), serial
+
+
+@contextlib.contextmanager
+def _until_recorded() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets inside the block; what comes after it is ended as ever."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
+    try:
+        yield stop_on_signals()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 _NO_ELECTRODES = "see palpate status, and palpate gateway list"
@@ -157,16 +170,36 @@ def _first(session: Session, topic: Topic[Message], sensor: str, remedy: str) ->
 
 
 class _Recording:
-    """A recorder in a thread of its own.
+    """A recorder in a thread and a folder of its own: others may record to ``out`` meanwhile.
 
     Attributes:
+        folder: What it writes to.
         failure: What ended it before its time; None = nothing.
     """
 
     def __init__(self, out: Path) -> None:
         self._out = out
-        self._before = set(out.glob("*.mcap"))
+        self._records: list[Path] = []
+        self.folder = out / f"calibrate-{os.getpid()}"
         self.failure: BaseException | None = None
+
+    def close(self) -> None:
+        """Move what was written to ``out``.
+
+        Raises:
+            RecordingError: The disk refused.
+        """
+        try:
+            for file in sorted(self.folder.glob("*.mcap*")):
+                moved = file.rename(self._out / file.name)
+                if moved.suffix == ".mcap":
+                    self._records.append(moved)
+            if self.folder.exists():
+                self.folder.rmdir()
+        except OSError as error:
+            raise RecordingError(
+                f"{self.folder}: {error.strerror}", remedy=f"what was recorded is in {self.folder}"
+            ) from error
 
     def check(self) -> None:
         """Raise what ended it: nobody shall press for nothing."""
@@ -180,26 +213,25 @@ class _Recording:
             RecordingError: There is none.
         """
         self.check()
-        new = sorted(set(self._out.glob("*.mcap")) - self._before)
-        if not new:
+        if not self._records:
             raise RecordingError(
                 f"no record was written to {self._out}", remedy="check the disk's free space"
             )
-        return new[-1]
+        return self._records[-1]
 
 
 @contextlib.contextmanager
 def _recording(link: LinkConfig, station: str, sensor: str, out: Path) -> Iterator[_Recording]:
     """Record the finger inside the block."""
+    recording, stop = _Recording(out), threading.Event()
     settings = {
         **EVERYTHING,
-        "out": str(out),
+        "out": str(recording.folder),
         "topics": ("electrodes", "wrench", "pose", "tare"),
         "sensor": sensor,
         "rrd": False,
     }
     config = parse_config(RecorderConfig, settings, where="command line")
-    recording, stop = _Recording(config.out), threading.Event()
 
     def run() -> None:
         try:
@@ -214,6 +246,7 @@ def _recording(link: LinkConfig, station: str, sensor: str, out: Path) -> Iterat
     finally:
         stop.set()
         thread.join()
+        recording.close()
 
 
 def _guide(

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from palpate.errors import MissingExtraError
+from palpate.errors import ConfigError, MissingExtraError
 
 EXTRA_MODULES = ("scipy", "warp", "pymetis", "threadpoolctl", "h5py", "matplotlib")
 """Packages that ``palpate[fem]`` installs and a bare palpate does not."""
@@ -272,6 +272,16 @@ def _given(context: typer.Context) -> frozenset[str]:
     )
 
 
+def _refuse_given(context: typer.Context, names: set[str], why: str) -> None:
+    """Refuse parameters that were given although they have no effect; ``why`` ends the sentence.
+
+    Raises:
+        ConfigError: One was; names it.
+    """
+    for name in sorted(names & _given(context)):
+        raise ConfigError(f"--{name.replace('_', '-')} has no effect {why}", remedy="leave it out")
+
+
 @fem_app.command(epilog=_example("palpate fem export runs/paper.sim paper.h5"))
 def export(
     store: Annotated[Path, typer.Argument(metavar="NAME.sim", help="A store of simulations.")],
@@ -415,6 +425,7 @@ def recover(
     epilog=_example("palpate fem validate measured.h5 --parameters fit.json --out runs/validation")
 )
 def validate(
+    context: typer.Context,
     measured: MeasuredArgument,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for table and plots.")] = Path(
         "runs/validation"
@@ -434,6 +445,9 @@ def validate(
     from palpate_fem.cli.identify import validate_command
     from palpate_fem.cli.model import model_of
 
+    if store is not None:
+        of_model = {"mesh", "edge_mm", "layers", "parameters"}
+        _refuse_given(context, of_model, "with --store, whose simulations are compared")
     model = model_of(mesh=mesh, edge_mm=edge_mm, layers=layers, fit=parameters)
     raise typer.Exit(
         validate_command(measured, out, only or [], model, store=store, workers=workers)
@@ -526,6 +540,7 @@ def serve(
     )
 )
 def fit(
+    context: typer.Context,
     store: Annotated[Path, typer.Argument(metavar="STORE", help="Simulated trajectories.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE.json", help="Where to write.")],
     overtravel_mm: Annotated[
@@ -557,10 +572,12 @@ def fit(
     touch was is found with the specimen.
     """
     if recording is None:
+        _refuse_given(context, {"sensor", "touches", "held_rows"}, "without --recording")
         from palpate_fem.cli.identify import fit_units_command
 
         fit_units_command(store, out, overtravel_m=overtravel_mm * 1e-3)
         return
+    _refuse_given(context, {"overtravel_mm"}, "with --recording")
     from palpate_fem.cli.identify import fit_sensor_command
 
     fit_sensor_command(store, out, recording, sensor=sensor, touches=touches, held_rows=held_rows)

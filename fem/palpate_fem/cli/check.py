@@ -17,7 +17,7 @@ from rich.table import Table
 
 from palpate.errors import ConfigError
 from palpate_fem.calibration.result import without_nan
-from palpate_fem.cli.terminal import print_lines, print_table, progress_bar
+from palpate_fem.cli.terminal import check_output, print_lines, print_table, progress_bar
 
 if TYPE_CHECKING:
     from palpate_fem.study import PathRow, StudyRow
@@ -119,9 +119,13 @@ def study_command(what: str, *, png: Path | None, as_json: bool) -> int:
     Returns:
         0, or 1 if the last refinement changed more than is accepted, or an indentation did not
         complete.
+
+    Raises:
+        ConfigError: The picture cannot be written.
     """
     from palpate_fem.study import EDGES_M, PRESSES, STEPS, mesh_study, step_study
 
+    check_output(png, "--png", ".png")
     total = len(PRESSES) * (len(EDGES_M) if what == "mesh" else len(STEPS))
     with progress_bar() as bar:
         task = bar.add_task(f"{what} study", total=total)

@@ -27,7 +27,14 @@ from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, re
 from palpate_fem.calibration.result import Calibration, Evaluation, write_calibration
 from palpate_fem.calibration.runs import FingertipSimulator, simulate_all
 from palpate_fem.cli.model import FingertipModel, workers_for
-from palpate_fem.cli.terminal import console, print_lines, print_table, progress_bar
+from palpate_fem.cli.terminal import (
+    check_folder,
+    check_output,
+    console,
+    print_lines,
+    print_table,
+    progress_bar,
+)
 from palpate_fem.config import EDGE_M, FingertipParameters
 from palpate_fem.electrodes.model import ElectrodeModel
 from palpate_fem.electrodes.specimen import SpecimenParameters
@@ -73,6 +80,8 @@ def calibrate_command(
     slopes: bool,
 ) -> int:
     """Calibrate and write the result; 1 if the search did not converge."""
+    check_output(out, "--out", ".json", measured)
+    check_output(png, "--png", ".png", measured)
     chosen = _chosen(measured, only)
     runs_with = slope_simulator_for if slopes else simulator_for
     with runs_with(model, workers, len(chosen)) as (simulator, executor, bar):
@@ -83,8 +92,9 @@ def calibrate_command(
             on_evaluation=bar.on_evaluation,
             on_run=bar.on_run,
         )
+    _show_calibration(result)  # first: it is all that is left of the search if the disk refuses
     write_calibration(out, result)
-    _show_calibration(result, out)
+    print_lines(f"wrote {out}")
     if png is not None:
         plot_calibration(result, png)
     return 0 if result.converged else 1
@@ -100,6 +110,7 @@ def validate_command(
     workers: int,
 ) -> int:
     """Compare, and write table and plots; 1 if nothing could be compared."""
+    check_folder(out, "--out")
     chosen = _chosen(measured, only)
     refused: dict[str, str] = {}
     if store is not None:
@@ -201,12 +212,12 @@ class _SearchBar:
         self._bar.update(self._task, completed=done, total=total)
 
 
-def _show_calibration(result: Calibration, out: Path) -> None:
+def _show_calibration(result: Calibration) -> None:
     title = "calibrated" if result.converged else "the search did not converge"
     print_table(CALIBRATION_HEADINGS, result.rows(), title=title)
     print_lines(
         f"cost {result.cost:.4g} N, {result.thickness_m * 1e3:.2f} mm thick, "
-        f"{result.simulations} runs; wrote {out}",
+        f"{result.simulations} runs",
         *(f"left out: {name}: {why}" for name, why in result.excluded.items()),
         *(f"note: {note}" for note in result.notes),
     )
@@ -284,6 +295,7 @@ def planned_travel_m(name: str) -> float:
 
 def fit_units_command(store: Path, out: Path, *, overtravel_m: float) -> None:
     """Fit the paper's three specimens on a store of the whole set, and write the population."""
+    check_output(out, "--out", ".json", store)
     if overtravel_m < 0:
         raise ConfigError(f"overtravel of {overtravel_m} m", remedy="give 0 or more")
     opened = SimulationStore.open(store)
@@ -314,6 +326,7 @@ def fit_sensor_command(
     store: Path, out: Path, recording: Path, *, sensor: str, touches: int | None, held_rows: int
 ) -> None:
     """Fit one specimen to a recorded sensor on a store of presses, and write it."""
+    check_output(out, "--out", ".json", store, recording)
     if touches is not None and touches < 0:
         raise ConfigError(f"{touches} touches", remedy="give 0 for the rest alone, or more")
     found = read_touches(recording, sensor=sensor, rows=held_rows)
@@ -381,6 +394,7 @@ DRAWN = (
 
 def draw_units_command(count: int, seed: int, out: Path | None, *, as_json: bool) -> None:
     """Draw specimens, write them, and print how their parameters spread."""
+    check_output(out, "--out", ".json")
     members = draw_members(count, seed)
     if out is not None:
         write_population(out, members, source=f"{count} drawn with seed {seed}")

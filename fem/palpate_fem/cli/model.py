@@ -11,6 +11,7 @@ from pathlib import Path
 
 from palpate.errors import ConfigError
 from palpate_fem.config import FingertipParameters
+from palpate_fem.mesh.solid import check_limits
 from palpate_fem.service.batch import SimulationBatch, TrajectoryBatch
 from palpate_fem.service.config import DEFAULT_FACTORY
 from palpate_fem.service.device_batch import SLOTS, DeviceBatch, threads_and_packers
@@ -89,6 +90,8 @@ def model_of(
     Raises:
         ConfigError: A value is out of range, or a file does not exist.
     """
+    # Here, for a worker would report it as a failure of its own.
+    check_limits(layers=layers, **({} if edge_mm is None else {"edge_m": edge_mm * 1e-3}))
     options: dict[str, object] = {"layers": layers}
     if mesh != PARAMETRIC:
         if not Path(mesh).is_dir():

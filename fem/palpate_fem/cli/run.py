@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import statistics
+import uuid
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -25,6 +26,8 @@ from palpate_fem.calibration.result import without_nan
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import (
+    check_folder,
+    check_output,
     console,
     print_lines,
     print_table,
@@ -149,11 +152,14 @@ class RunOptions:
                     remedy="add --sweep, or leave it out",
                 )
         check_places(self.devices, self.slots, self.ray)
+        check_output(self.png, "--png", ".png")
         if self.store is not None and self.store.suffix != SUFFIX:
             raise ConfigError(
                 f"--store {self.store} does not end in {SUFFIX}",
                 remedy=f"call it {self.store.stem}{SUFFIX}",
             )
+        if self.store is not None:
+            check_folder(self.store, "--store")
         if not self.sweep and len(self.indenters) > 1:
             raise ConfigError(
                 "several indenters without --sweep", remedy="add --sweep, or name one"
@@ -183,7 +189,9 @@ class RunOptions:
         """The trajectories to run on a fingertip."""
         skin = skin_of(fingertip)
         if self.sweep:
-            names = tuple(make_indenter(name).name for name in self.indenters) or indenter_names()
+            # An indenter has several names.
+            named = dict.fromkeys(make_indenter(name).name for name in self.indenters)
+            names = tuple(named) or indenter_names()
             return points_first(
                 Campaign(skin, names, self.points, self.seed, self.steps, angled=self.angled)
             )
@@ -216,7 +224,8 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
     """Run, show, draw.
 
     Returns:
-        0, or 1 if a trajectory neither completed nor ended at the force limit.
+        0, or 1 if a trajectory, of those that were there already, too, neither completed nor ended
+        at the force limit.
     """
     options.check()
     sweep, store = options.sweep, options.store
@@ -229,7 +238,7 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
         ray=options.ray,
     )
     done: list[IndentationResult] = []
-    present = 0
+    present = earlier = 0
     with (
         stop_on_signal() as stop,
         make_batch() as batch,
@@ -269,10 +278,14 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
                 command=typed_command(),
                 packers=packers,
             )
-    if store is not None and not sweep:
+    if store is not None:
         opened = SimulationStore.open(store)
         there = set(opened.ids())
-        done = [opened.trajectory(plan.name) for plan in plans if plan.name in there]
+        held = [plan.name for plan in plans if plan.name in there]
+        new = {early.name for early in report.early}
+        earlier = sum(opened.outcome(name).value not in GOOD for name in held if name not in new)
+        if not sweep:
+            done = [opened.trajectory(name) for name in held]
     if options.as_json:
         write_json(fingertip, done, report, present, options.places)
     else:
@@ -281,10 +294,11 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
             show_summaries(store, [plan.name for plan in plans])
         for trajectory in done:
             show_trajectory(fingertip, trajectory)
-        show_report(report, present, store, options.places)
+        show_report(report, present, store, options.places, earlier=earlier)
     if options.png is not None:
         _draw(options.png, fingertip, done, store if sweep else None)
-    return 0 if not report.stopped and all(early.how in GOOD for early in report.early) else 1
+    failed = earlier or any(early.how not in GOOD for early in report.early)
+    return 1 if report.stopped or failed else 0
 
 
 def export_command(store: Path, out: Path) -> None:
@@ -363,7 +377,14 @@ def serve_command(
         to=console,
     )
     node.run(
-        config, link, station, stop, on_ready=lambda: print_lines("ready for requests", to=console)
+        config,
+        link,
+        station,
+        stop,
+        # Callers choose a service by this name, so no other at the station may have it.
+        instance=f"{node.SERVICE}-{uuid.uuid4().hex[:8]}",
+        on_ready=lambda: print_lines("ready for requests", to=console),
+        on_refusal=lambda refusal: print_lines(f"does not serve: {refusal}", to=console),
     )
 
 
@@ -426,9 +447,17 @@ def show_summaries(store: Path, names: Sequence[str]) -> None:
 
 
 def show_report(
-    report: BatchReport, present: int, store: Path | None, places: Sequence[str] = ()
+    report: BatchReport,
+    present: int,
+    store: Path | None,
+    places: Sequence[str] = (),
+    *,
+    earlier: int = 0,
 ) -> None:
-    """Print every early end, and a summary; with places also how quick these were."""
+    """Print every early end, and a summary; with places also how quick these were.
+
+    Of the ``present`` ones, ``earlier`` ended otherwise than in ``GOOD``.
+    """
     if report.early:
         more = len(report.early) - _SHOWN_EARLY
         print_table(
@@ -443,7 +472,10 @@ def show_report(
     outcomes = ", ".join(f"{count} {how}" for how, count in sorted(report.outcomes.items()))
     parts = [f"{report.done} of {report.total} run" + (f": {outcomes}" if outcomes else "")]
     if present:
-        parts.append(f"{present} were there already")
+        parts.append(
+            f"{present} were there already"
+            + (f", of which {earlier} did not complete" if earlier else "")
+        )
     if places and report.done:
         each_ms = report.wall_s / report.done * 1e3
         parts.append(f"{each_ms:.0f} ms a trajectory on {', '.join(places)}")

@@ -70,7 +70,8 @@ class Fingertip:
         """A fingertip that is filled with its fluid.
 
         Args:
-            geometry: Mesh and core.
+            geometry: Mesh and core. The mesh is as thick as it was made: ``skin_thickness_m`` of
+                the parameters is not looked at, give it to the mesh, too.
             parameters: Physical parameters; None = the paper's optimum.
             settings: Tolerances and limits of the solver.
             progress: Called with the fraction done.
@@ -138,7 +139,7 @@ class Fingertip:
             raise SimulationError(
                 f"the unpressurised skin is {low[1] * 1e3:.2f} mm thick already, "
                 f"{wanted * 1e3:.2f} mm are wanted",
-                remedy="raise total_thickness_m or give fluid_volume_m3",
+                remedy="take a thinner skin, or give the fluid (fluid_volume_m3, --fill-ml)",
             )
         begin = low[1]
         # First guess of d thickness / d volume; the BioTac grows by 1.45 mm in 474 mm^3.
@@ -173,18 +174,12 @@ class Fingertip:
         core, folds included, was never checked.
         """
         least = self.cavity_m3 - self.core_volume
-        if fluid_m3 >= least:
-            return
-        try:
-            self._fill_to(fluid_m3 + self.core_volume, STEPS_TO_PRESSURISE)
-            found = f"{self.state.fluid_pressure / 1e3:.2f} kPa"
-        except SimulationError:
-            found = "below ambient, without an equilibrium"
-        raise SimulationError(
-            f"{fluid_m3 * 1e6:.3f} ml of fluid suck the skin inwards, at {found}",
-            remedy=f"fill in at least {math.ceil(least * 1e9) * 1e-3:.3f} ml, which the "
-            "unpressurised skin holds, or leave the volume out",
-        )
+        if fluid_m3 < least:
+            raise SimulationError(
+                f"{fluid_m3 * 1e6:.3f} ml of fluid suck the skin inwards",
+                remedy=f"fill in at least {math.ceil(least * 1e9) * 1e-3:.3f} ml, which the "
+                "unpressurised skin holds, or leave the volume out",
+            )
 
     def _fill_to(self, cavity: float, steps: int) -> None:
         """Bring the cavity to a volume [m^3] in steps; those that do not converge are halved."""

@@ -329,8 +329,8 @@ def sweep_into_store(
         had claimed is in neither: it runs there, or was lost with it.
 
     Raises:
-        DatasetError: The store belongs to another fingertip, is damaged or in use, or the disk
-            refuses.
+        DatasetError: The store belongs to another fingertip, is damaged or in use, keeps stress
+            otherwise than wanted, or the disk refuses.
         RemoteError: The solver does not start.
         ConfigError: The batch takes more trajectories at once than this process may open files.
     """
@@ -350,6 +350,8 @@ def sweep_into_store(
         done = store.done()
         left = [plan for plan in plans if plan.name not in done]
         _check_paths(path, [plan for plan in plans if plan.name in done])
+        if stress or left:
+            _check_stress(store, sorted(done), stress=stress)
         claims: dict[str, TrajectoryClaim] = {}
         unmade: list[EarlyEnd] = []
 
@@ -405,6 +407,22 @@ def _check_paths(store: Path, known: Sequence[TrajectoryPlan]) -> None:
                 f"{store}: {plan.name} has another path there than is planned now",
                 remedy="give the points, seed, steps and depths that it was made with, or another "
                 "file",
+            )
+
+
+def _check_stress(store: SimulationStore, done: Sequence[str], *, stress: bool) -> None:
+    """Check that trajectories that are there, three of them, have stress as others will.
+
+    Raises:
+        DatasetError: One differs.
+    """
+    for name in {done[0], done[len(done) // 2], done[-1]} if done else ():
+        with store.group(name) as group:
+            differs = len(group["pose"]) > 0 and ("stress" in group) is not stress
+        if differs:
+            raise DatasetError(
+                f"{store.path}: {name} was stored {'without' if stress else 'with'} stress",
+                remedy=f"{'leave out' if stress else 'give'} --stress, or name another store",
             )
 
 

@@ -7,12 +7,14 @@ gets an answer: its steps and how it ended, or a typed error.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import asdict
+from typing import Any
 
 from palpate import __version__
 from palpate.bus import Presence, Publisher, QueryAnswer, SensorClaims, Session, endpoints
@@ -46,7 +48,7 @@ from palpate_fem.result import IndentationOutcome, IndentationStep
 from palpate_fem.service.config import FemConfig
 from palpate_fem.service.device_pool import DevicePool
 from palpate_fem.service.device_process import wanted_device
-from palpate_fem.service.fingertips import without_friction
+from palpate_fem.service.fingertips import load_factory, without_friction
 from palpate_fem.service.jobs import (
     JobEnded,
     JobEvent,
@@ -359,6 +361,7 @@ def run(
     *,
     instance: str = SERVICE,
     on_ready: Callable[[], None] | None = None,
+    on_refusal: Callable[[ClaimedElsewhere], None] | None = None,
 ) -> None:
     """Serve until ``stop`` is set; then answer what is left with UNAVAILABLE, and end.
 
@@ -369,6 +372,7 @@ def run(
         stop: Set it to end.
         instance: Name of this process among several of its kind.
         on_ready: Called once, when it answers and a worker waits for requests.
+        on_refusal: Called with why it does not answer, as another service does that differs.
 
     Raises:
         ConfigError: A parameter is out of range, or there is no such device.
@@ -394,7 +398,7 @@ def run(
             health.set_state(ServiceState.STARTING, "the first fingertip is being pressurised")
             claims.wait(config.sensor, _CLAIM_S)
             try:
-                _serve(service.pool, health, presence, stop, doors, on_ready)
+                _serve(service.pool, health, presence, stop, doors, on_ready, on_refusal)
             finally:
                 presence.not_ready()
                 health.set_state(ServiceState.STOPPING)
@@ -405,10 +409,20 @@ def answers_digest(config: FemConfig) -> str:
     told = {
         "version": __version__,
         "factory": config.factory,
-        "options": config.options,
+        "options": _all_options(config),
         "fingertip": asdict(config.fingertip.parameters()),
     }
     return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _all_options(config: FemConfig) -> dict[str, Any]:
+    """Arguments of the factory, those at their defaults included."""
+    try:
+        bound = inspect.signature(load_factory(config.factory)).bind(**config.options)
+    except (ConfigError, TypeError):  # the workers say what is wrong with it
+        return config.options
+    bound.apply_defaults()
+    return bound.arguments
 
 
 class _Doors(Closing):
@@ -472,6 +486,7 @@ def _serve(
     stop: threading.Event,
     doors: _Doors,
     on_ready: Callable[[], None] | None,
+    on_refusal: Callable[[ClaimedElsewhere], None] | None,
 ) -> None:
     """Show as ready while a worker is; requests that come earlier wait for one.
 
@@ -486,7 +501,10 @@ def _serve(
             raise pool.broken
         if (refusal := doors.check()) is not None:
             presence.not_ready()
-            told = ServiceState.DEGRADED, refusal.problem
+            found = ServiceState.DEGRADED, refusal.problem
+            if found != told and on_refusal is not None:
+                on_refusal(refusal)
+            told = found
             health.fail(refusal)
             continue
         if pool.ready:

@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 
 from palpate.errors import ConfigError, DatasetError
-from palpate.files.hdf5 import new_file
+from palpate.files.hdf5 import new_file, text
 from palpate.files.simulation_store import FINGERTIP, SUFFIX, TRAJECTORIES, check_id
 from palpate.process import Closing
 from palpate_fem.result import IndentationResult
@@ -209,6 +209,7 @@ class StoreWriter(SimulationStore, Closing):
             with FileClaim(head, wait=True) as claim:
                 if not head.exists():  # else another process has created it while we waited
                     tip = self._fingertip
+                    self._check_orphans()
                     claim.commit(
                         file_image(lambda file: write_fingertip(file, tip), command=self._command)
                     )
@@ -218,6 +219,16 @@ class StoreWriter(SimulationStore, Closing):
                 f"{self.path} is another fingertip's: {'; '.join(differences)} as in the store",
                 remedy="write to a new store, or use the parameters and settings of this one",
             )
+
+    def _check_orphans(self) -> None:
+        """Refuse trajectories whose fingertip is not there, if they are of another one."""
+        for name in self.ids():
+            with self.group(name) as group:
+                if text(group.attrs.get("fingertip", "")) != self._fingertip.key:
+                    raise StoreMismatchError(
+                        f"{self.path} has lost its {FINGERTIP}, and {name} is another fingertip's",
+                        remedy=f"bring {FINGERTIP} back, or write to a new store",
+                    )
 
     def _check_place(self, trajectory: str) -> None:
         """Refuse an id inside another one: in an export, one group would contain the other."""

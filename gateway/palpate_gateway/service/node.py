@@ -79,6 +79,7 @@ def run(
         for sensor, device in zip(config.sensors, devices, strict=True):
             # A live source must never wait for a slow subscriber, whatever the pace of others.
             lossless = config.pace == "fast" and not device.info.live
+            key = ClaimedKey(claims, sensor, sources)
             worker = SensorWorker(
                 sensor.name,
                 device,
@@ -91,20 +92,17 @@ def run(
                 pace=config.pace,
                 stop=stop,
                 wall=wall,
-                key=ClaimedKey(claims, sensor, sources),
+                key=key,
                 fingers=fingers,
             )
             workers.append(worker)
-            if isinstance(device, WrenchDevice):
-                session.stream_queryable(
-                    endpoints.ZERO, with_caller(station, worker.answer_zero), sensor=sensor.name
-                )
-                continue  # without electrodes there is no baseline
-            if sensor.of is not None:
-                continue  # its finger answers such requests
-            session.stream_queryable(
-                endpoints.TARE, with_caller(station, worker.answer_tare), sensor=sensor.name
-            )
+            answer = partial(session.stream_queryable, sensor=sensor.name)
+            if isinstance(device, WrenchDevice):  # without electrodes there is no baseline
+                zero = with_caller(station, worker.answer_zero)
+                key.answer_by(partial(answer, endpoints.ZERO, zero))
+            elif sensor.of is None:  # else its finger answers such requests
+                tare = with_caller(station, worker.answer_tare)
+                key.answer_by(partial(answer, endpoints.TARE, tare))
 
         def caller_gone(caller: str, when_s: float) -> None:
             for worker in workers:

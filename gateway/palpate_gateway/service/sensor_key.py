@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from palpate.bus import SensorClaims
 from palpate.errors import ClaimedElsewhere, ConfigError
+from palpate.process import Closing
 from palpate_gateway.config import SensorConfig
 
 _POLL_S = 0.1
@@ -48,13 +49,30 @@ class ClaimedKey(SensorKey):
         self._claims, self._sensor, self._sources = claims, sensor, sources
         self._name = sensor.key_name
         self.patience_s = claims.lease_s
+        self._declare: Callable[[], Closing] | None = None
+        self._queryable: Closing | None = None
         claims.want(self._name)
+
+    def answer_by(self, declare: Callable[[], Closing]) -> None:
+        """Answer questions to the sensor by what ``declare`` makes, while the key is held.
+
+        A question goes to one of those that answer: it must not be the one that waits.
+        """
+        self._declare = declare
+
+    def _stop_answering(self) -> None:
+        if self._queryable is not None:
+            self._queryable.close()
+            self._queryable = None
 
     def wait(self, stop: threading.Event, refused: Callable[[ClaimedElsewhere], None]) -> bool:
         """See ``SensorKey``."""
         while not stop.is_set():
             if self._claims.wait(self._name, _POLL_S):
+                if self._queryable is None and self._declare is not None:
+                    self._queryable = self._declare()
                 return True
+            self._stop_answering()
             if (error := self._claims.refusal(self._name)) is not None:
                 refused(error)
         return False
@@ -71,7 +89,11 @@ class ClaimedKey(SensorKey):
             ClaimedElsewhere: Another gateway has taken the key over.
             ConfigError: Another sensor of this gateway publishes the stream.
         """
-        self._claims.check(self._name)
+        try:
+            self._claims.check(self._name)
+        except ClaimedElsewhere:
+            self._stop_answering()
+            raise
         source = self._sources.get((self._name, stream))
         if source == self._sensor.name:
             return

@@ -21,6 +21,7 @@ from palpate.errors import (
     PalpateError,
     RemoteError,
     ReplicaDiffers,
+    StreamTimeout,
     WireError,
 )
 from palpate.messages import (
@@ -98,7 +99,8 @@ def ask_simulation(
         RemoteError: It refuses, or cannot go on. Steps that had converged were given to
             ``on_step``.
         ReplicaDiffers: One ended, and another would answer for another fingertip.
-        StreamTimeout: No answer within ``GRACE_S`` after the deadline.
+        StreamTimeout: No answer within ``GRACE_S`` after the deadline, or it was over before a
+            service could be asked.
         WireError: The request, or an answer, breaks the contract.
     """
     check_name(sensor, "sensor")
@@ -115,9 +117,14 @@ def ask_simulation(
             left_s = end_s - time.monotonic()
             if error is not None and (replica is None or left_s <= 0.0):
                 raise error
+            if left_s <= 0.0:
+                raise StreamTimeout(
+                    f"the {deadline_s:g} s were over before a service was asked",
+                    remedy="allow more time",
+                )
             again = dataclasses.replace(request, deadline_s=left_s)
             wait_s = left_s + GRACE_S
-            # A service of an older palpate has no key of its own.
+            # A service of an older palpate, or one of a name used twice, has no key of its own.
             parts = (
                 session.query_stream(endpoints.SIMULATE, again, sensor=sensor, timeout_s=wait_s)
                 if replica is None
@@ -136,12 +143,16 @@ def ask_simulation(
 def _next_replica(session: Session, sensor: str, asked: set[str], patience_s: float) -> str | None:
     """A service that answers for ``sensor`` and is not in ``asked``, by chance; it is added.
 
-    If there is none, it is waited for as long as it may.
+    If there is none, it is waited for as long as it may. One whose name a service of another sensor
+    has, too, is none: its own key would lead to either.
     """
     end_s = time.monotonic() + patience_s
-    while not (
-        left := {one.instance for one in session.holders(duty_root("simulate"), sensor)} - asked
-    ):
+    while True:
+        held = session.holders(duty_root("simulate"), "*")
+        elsewhere = {one.instance for one in held if one.sensor != sensor}
+        left = {one.instance for one in held if one.sensor == sensor} - elsewhere - asked
+        if left:
+            break
         if time.monotonic() >= end_s:
             return None
         time.sleep(_POLL_S)

@@ -103,6 +103,18 @@ class _Encoded:
         stream.write(self.data)
 
 
+class RecordGone(RecordingError):
+    """The file of a record was removed, replaced or moved away while it was written.
+
+    Attributes:
+        lost: Messages that are lost with it; 0 = it was moved, and holds them where it is now.
+    """
+
+    def __init__(self, problem: str, *, remedy: str, lost: int) -> None:
+        super().__init__(problem, remedy=remedy)
+        self.lost = lost
+
+
 class RecordWriter:
     """Writes a record. ``write`` and ``flush`` belong to one thread.
 
@@ -223,6 +235,37 @@ class RecordWriter:
             raise self._failed(error) from error
         self._last_flush = time.monotonic()
 
+    def check_place(self) -> None:
+        """Check that the ``.part`` is still the file that is written.
+
+        Raises:
+            RecordGone: It is not; the writer can only be abandoned.
+            RecordingError: The disk is full or gone.
+        """
+        own = os.fstat(self._file.fileno())
+        try:
+            if os.path.samestat(own, self.part.stat()):
+                return
+        except (FileNotFoundError, NotADirectoryError):
+            pass
+        except OSError as error:
+            raise self._failed(error) from error
+        count = sum(self.counts.values())
+        if own.st_nlink:
+            self.flush()
+            self._broken = RecordGone(
+                f"{self.part} was moved away while it was written, with {count:,} messages",
+                remedy="recover it where it is now: palpate recover",
+                lost=0,
+            )
+        else:
+            self._broken = RecordGone(
+                f"{self.part} was removed while it was written: {count:,} messages are lost",
+                remedy="leave a folder alone while something records to it",
+                lost=count,
+            )
+        raise self._broken
+
     @property
     def bytes_written(self) -> int:
         """Size of the file so far [bytes]."""
@@ -234,11 +277,13 @@ class RecordWriter:
         Raises:
             RecordingError: The disk is full or gone, or an earlier write has failed: half of that
                 write may stand in the file, which must not look whole. The ``.part`` stays.
+            RecordGone: The ``.part`` is another file now, or none.
         """
         if self._closed:
             return
         if self._broken is not None:
             raise self._broken
+        self.check_place()
         self._closed = True
         try:
             self._writer.finish()

@@ -39,10 +39,12 @@ def run_recorder(
     stop: threading.Event,
     *,
     instance: str = "recorder",
+    health: Health | None = None,
 ) -> None:
     """Record until ``stop`` is set; then write the samples that have arrived and close the files.
 
-    The arguments are those of ``run_estimating``.
+    The arguments are those of ``run_estimating``; ``health`` receives state and counters, None = it
+    makes its own.
 
     Raises:
         ConfigError: An unknown topic, or a bundle that does not exist.
@@ -50,7 +52,7 @@ def run_recorder(
         RecordingError: The folder of the records cannot be made.
     """
     topics = _topics(config.topics)
-    health = Health(SERVICE, instance)
+    health = health or Health(SERVICE, instance)
     with Session.open(link, station=station) as session:
         find_tare = TareBook(session).find if TARE in topics else None
         files = RecordFiles(config, station, health, find_tare)

@@ -17,7 +17,7 @@ from typing import Any
 from palpate.bus import TapSample
 from palpate.bus.topics import FIELD, FIELD_TRUTH, TARE, TOPICS, Topic, sensor_key
 from palpate.errors import ErrorCode, RecordingError, WireError
-from palpate.files.record import RecordWriter, Recovery, is_being_written, recover
+from palpate.files.record import RecordGone, RecordWriter, Recovery, is_being_written, recover
 from palpate.health import Health
 from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
 from palpate_services.config import RecorderConfig
@@ -226,6 +226,11 @@ class RecordFiles:
         Raises:
             RecordingError: The folder cannot be made. A full disk is no error but a state.
         """
+        self._make_folder()
+        self._recovery.start()
+        self._open()
+
+    def _make_folder(self) -> None:
         try:
             self._config.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -233,8 +238,6 @@ class RecordFiles:
                 f"recorder.out = {self._config.out}: {error.strerror}",
                 remedy="set recorder.out to a folder this user may write to",
             ) from error
-        self._recovery.start()
-        self._open()
 
     def write(self, sample: TapSample) -> None:
         """Record one sample; without a disk to write to it is counted as ``lost_disk_full``."""
@@ -402,6 +405,7 @@ class RecordFiles:
         return self._config.out / f"{self._station}-{stamp}.mcap"
 
     def _check_room(self, wanted: int) -> None:
+        self._make_folder()  # somebody may have removed it
         free = free_bytes(self._config.out)
         self._health.gauge("disk_free_bytes", float(free))
         if free < wanted:
@@ -410,9 +414,14 @@ class RecordFiles:
     def _check(self, writer: RecordWriter, now_s: float, *, idle: bool) -> None:
         config = self._config
         try:
+            writer.check_place()
             if idle:
                 self._flush(writer)
             self._check_room(config.min_free_bytes)
+        except RecordGone:
+            self._close_files()  # tells it
+            self._open()
+            return
         except RecordingError as error:
             self._pause(error.problem)
             return
@@ -442,7 +451,7 @@ class RecordFiles:
         self._tried_s = now_s
         try:
             self._check_room(self._config.min_free_bytes + RESUME_MARGIN_BYTES)
-        except DiskError as error:
+        except RecordingError as error:
             self._fail(error.problem)
             return
         self._open()
@@ -477,6 +486,13 @@ class RecordFiles:
         if writer is not None:
             try:
                 writer.close()
+            except RecordGone as gone:
+                self._unflushed = 0  # among those that are lost with it
+                self._counts["lost_with_record"] += gone.lost
+                self._counts["records_gone"] += 1
+                _log.error("%s", gone)
+                self._health.fail(gone)
+                writer.abandon()
             except RecordingError as error:
                 problem = error.problem
                 self._count_unflushed()

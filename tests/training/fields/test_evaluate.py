@@ -17,7 +17,7 @@ from palpate_training.cli import train_app
 from palpate_training.datasets.basis import subset
 from palpate_training.datasets.experiment import MixedDataset, write_mixed
 from palpate_training.datasets.export import features
-from palpate_training.datasets.features import write_dataset
+from palpate_training.datasets.features import open_dataset, write_dataset
 from palpate_training.learning.features_net import FeaturesNetConfig
 from palpate_training.learning.splits import by_trajectory, of_units
 from palpate_training.tasks.evaluate import BundleErrors, Figure, evaluate
@@ -104,8 +104,9 @@ def test_features_of_both_kinds_of_file_and_of_one_specimen(of_features: Path) -
     assert [one.value for one in found.figures] == pytest.approx(
         [one.value for one in mixed.figures], nan_ok=True
     )
-    twice = evaluate(folder / "bundle", [folder / "mixed.h5", folder / "mixed.h5"])
-    assert (twice.rows, twice.presses) == (2 * mixed.rows, 2 * mixed.presses)
+    for name in ("mixed.h5", "features.h5"):
+        with pytest.raises(DatasetError, match="hold the same presses"):
+            evaluate(folder / "bundle", [folder / "mixed.h5", folder / name])
     own = evaluate(folder / "bundle", [folder / "mixed.h5"], unit=UNIT)
     assert 0 < own.rows < mixed.rows
     by_bin = [one.rows for one in found.figures if one.name == "force_magnitude"]
@@ -117,8 +118,6 @@ def test_features_of_both_kinds_of_file_and_of_one_specimen(of_features: Path) -
 def test_rows_without_contact_are_left_out_and_not_enough(
     of_features: Path, tmp_path: Path
 ) -> None:
-    from palpate_training.datasets.features import open_dataset
-
     data = open_dataset(of_features / "features.h5")
     none = replace(
         data,
@@ -130,6 +129,23 @@ def test_rows_without_contact_are_left_out_and_not_enough(
     write_dataset(tmp_path / "none.h5", none)
     with pytest.raises(DatasetError, match="no row is in contact"):
         evaluate(of_features / "bundle", [tmp_path / "none.h5"])
+
+
+def test_one_press_has_no_interval(of_features: Path, tmp_path: Path) -> None:
+    data = open_dataset(of_features / "features.h5")
+    assert data.in_contact is not None
+    own = np.flatnonzero(data.group == data.group[data.in_contact][0])
+    columns = {name: values[own] for name, values in data.arrays().items()}
+    write_dataset(tmp_path / "one.h5", replace(data, **columns))
+    found = evaluate(of_features / "bundle", [tmp_path / "one.h5"])
+    first = found.figures[0]
+    assert first.presses == 1
+    assert np.isfinite(first.value)
+    assert np.isnan([first.low, first.high]).all()
+    assert found.as_dict()["figures"][0]["ci95"] == [None, None]
+    told = ["evaluate", str(of_features / "bundle"), str(tmp_path / "one.h5")]
+    shown = CliRunner().invoke(train_app, told)
+    assert "nan" not in shown.output
 
 
 def test_the_command_shows_and_writes(of_features: Path, tmp_path: Path) -> None:

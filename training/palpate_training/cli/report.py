@@ -8,6 +8,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 from rich.box import SIMPLE
 from rich.console import Console
@@ -190,7 +191,7 @@ def _table(found: BundleErrors) -> Table:
                 head,
                 one.where.replace("_", " ").replace("2n", "2 N").replace("8n", "8 N"),
                 f"{factor * one.value:.3g}",
-                f"{factor * one.low:.3g} to {factor * one.high:.3g}",
+                "-" if np.isnan(one.low) else f"{factor * one.low:.3g} to {factor * one.high:.3g}",
                 f"{factor * one.constant:.3g}",
                 end_section=one is rows[-1],
             )

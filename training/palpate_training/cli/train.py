@@ -457,8 +457,9 @@ def train_line(
 
     palpate train line features.h5 twin-line.json
     """
-    from palpate_training.learning.twin_line import fit_line, write_line
+    from palpate_training.learning.twin_line import check_place, fit_line, write_line
 
+    check_place(out)
     write_line(out, fit_line(open_dataset(data)))
     console.print(f"wrote {out}")
 

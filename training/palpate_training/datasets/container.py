@@ -170,6 +170,45 @@ def add_array(digest: hashlib._Hash, name: str, array: npt.NDArray[Any]) -> None
     digest.update(little.tobytes())
 
 
+REPEATED_SHARE = 0.01
+"""Of the rows of a data set that another one may hold, too."""
+
+
+def refuse_repeated(
+    names: Sequence[str | Path],
+    parts: Sequence[tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]],
+) -> None:
+    """Refuse presses that are in two data sets: they would count twice, and be tested on.
+
+    Rows are compared, not digests: a copy may be shrunk, or have come back from a table.
+
+    Args:
+        names: Of the data sets.
+        parts: Tared electrodes (N, 19) and force (N, 3) of each; rows without a force say nothing.
+
+    Raises:
+        DatasetError: They are.
+    """
+    known: list[npt.NDArray[np.uint64]] = []
+    for number, (tared, force) in enumerate(parts):
+        codes = _row_codes(np.hstack([tared, force])[np.any(force != 0.0, axis=1)])
+        for first, others in enumerate(known):
+            same = int(np.isin(codes, others).sum())
+            if same > REPEATED_SHARE * min(len(codes), len(others)):
+                raise DatasetError(
+                    f"{names[number]} and {names[first]} hold the same presses: {same} rows",
+                    remedy="give each data set once, and none beside one that it is a part of",
+                )
+        known.append(codes)
+
+
+def _row_codes(rows: npt.NDArray[np.floating]) -> npt.NDArray[np.uint64]:
+    """A number of each row (N, K), as float32; others have the same by chance only."""
+    words = np.ascontiguousarray(rows, np.float32).view(np.uint32).astype(np.uint64)
+    weights = np.random.default_rng(0).integers(1, 2**63, words.shape[1], dtype=np.uint64)
+    return np.asarray((words * weights).sum(axis=1, dtype=np.uint64))
+
+
 def write_tables(
     path: Path, schema: Hdf5Schema, columns: Mapping[str, StoredColumn], tables: StoredTables
 ) -> str:

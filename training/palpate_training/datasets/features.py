@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from palpate_training.datasets.container import (
     add_array,
     joined_provenance,
     read_provenance,
+    refuse_repeated,
     write_provenance,
 )
 
@@ -114,8 +115,12 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
         command: For provenance.
 
     Raises:
-        DatasetError: A part lacks a column that another one has, or has another licence.
+        DatasetError: A part lacks a column that another one has, has another licence, or holds the
+            same presses.
     """
+    refuse_repeated(
+        [part.name for part in parts], [(part.tared_counts, part.force) for part in parts]
+    )
     columns = [set(part.arrays()) for part in parts]
     for part, have in zip(parts, columns, strict=True):
         if missing := sorted(set.union(*columns) - have):
@@ -143,6 +148,19 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
         ),
         name="joined",
     )
+
+
+def press_of(data: FeatureDataset) -> IndexArray:
+    """Press of each row, shape ``(N,)``; a single group is told apart by its blocks."""
+    return data.group if len(np.unique(data.group)) > 1 else data.block
+
+
+def of_sensor(data: FeatureDataset, name: str) -> FeatureDataset:
+    """The rows of one of its sensors, of which there must be some, alone."""
+    own = data.sensor == data.sensor_names.index(name)
+    columns = {column: values[own] for column, values in data.arrays().items()}
+    columns["sensor"] = np.zeros(own.sum(), np.int32)
+    return replace(data, **columns, sensor_names=(name,), name=f"{data.name}, {name}")
 
 
 def cut_into_blocks(rows: int, blocks: int) -> IndexArray:

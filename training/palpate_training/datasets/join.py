@@ -24,7 +24,7 @@ from palpate_training.datasets.basis import (
     with_signs,
     with_step,
 )
-from palpate_training.datasets.container import Provenance, joined_provenance
+from palpate_training.datasets.container import Provenance, joined_provenance, refuse_repeated
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     FieldBasis,
@@ -52,7 +52,7 @@ def join_files(
 
     Raises:
         DatasetError: A file is missing, damaged or no mixed data set, ``out`` exists, two parts
-            have the same name, the disk refuses, or as in ``join_mixed``.
+            have the same name or hold the same presses, the disk refuses, or as in ``join_mixed``.
     """
     if out.exists():
         raise DatasetError(f"{out} exists", remedy="remove it, or give another name")
@@ -64,8 +64,10 @@ def join_files(
             f"parts are called {', '.join(names)}",
             remedy="give files, or folders of them, different names",
         )
+    parts = [read_mixed(path) for path in paths]
+    refuse_repeated(paths, [(part.experiment.tared, part.experiment.force) for part in parts])
     joined = join_mixed(
-        [read_mixed(path) for path in paths],
+        parts,
         names,
         modes=modes,
         force_modes=force_modes,

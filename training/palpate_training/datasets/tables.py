@@ -40,6 +40,9 @@ Values = npt.NDArray[np.float64]
 BLOCKS = 20
 """Contiguous pieces that a sensor's rows are cut into where nothing says what one press is."""
 
+MISSING = np.iinfo(np.int64).min
+"""Stands for a time, a label or a truth that a row lacks."""
+
 METADATA = b"palpate.features"
 """Key of a table's metadata: where its rows come from, as JSON."""
 
@@ -234,8 +237,9 @@ def dataset_of(
         drop_incomplete: Leave rows out in which a number is missing; else they are an error.
 
     Raises:
-        DatasetError: A column is missing, of another width, or holds something else; a number is
-            missing; electrodes are no whole counts; nothing says what electrodes read untouched.
+        DatasetError: A column is missing, there twice, of another width, or holds something else; a
+            number is missing; electrodes are no whole counts; nothing says what electrodes read
+            untouched; rows of a press are not in order of time.
     """
     reader = _Reader(table, source)
     arrays: dict[str, Any] = {
@@ -258,11 +262,13 @@ def dataset_of(
     rows = len(arrays["electrodes"])
     kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
     arrays = {name: array[kept] for name, array in arrays.items()}
-    arrays["electrodes"] = _counts(arrays["electrodes"], source)
+    arrays["electrodes"] = _counts(arrays["electrodes"], np.flatnonzero(kept), source)
     if "baseline" not in arrays:
         arrays["baseline"] = _rest(arrays, columns.rest_rows, source)
     across = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
     arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
+    if "time_ns" in arrays:
+        _check_order(arrays, np.flatnonzero(kept), source)
     left_out = rows - len(arrays["electrodes"])
     known = _provenance(table)
     return FeatureDataset(
@@ -317,32 +323,39 @@ class _Reader:
             )
         return np.stack([self._column(name) for name in names], axis=1)
 
-    def truths(self, name: str) -> npt.NDArray[np.bool_]:
-        """True and false, shape (N,)."""
+    def truths(self, name: str) -> npt.NDArray[np.int64]:
+        """1 = true, 0 = false, or ``MISSING``, shape (N,)."""
         values = self._column(name)
-        wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
+        lacking = np.isnan(values)
+        wrong = np.flatnonzero((values != 0.0) & (values != 1.0) & ~lacking)
         if wrong.size:
             raise self._wrong(name, int(wrong[0]), f"{values[wrong[0]]:g}", "true or false")
-        return np.asarray(values == 1.0)
+        return np.where(lacking, MISSING, values == 1.0)
 
     def times(self, name: str, scale: float) -> npt.NDArray[np.int64]:
-        """Times [ns], shape (N,); whole numbers are not rounded."""
+        """Times [ns] or ``MISSING``, shape (N,); whole numbers are not rounded."""
         column = self._found(name)
         if scale == 1.0 and str(column.type) in ("int64", "uint64", "int32", "uint32"):
-            return np.asarray(column.to_numpy(), np.int64)
+            whole = np.asarray(column.fill_null(0).to_numpy(), np.int64)
+            return np.where(column.is_null().to_numpy(), MISSING, whole)
         values = self._column(name)
-        wrong = np.flatnonzero(~(np.abs(values * scale) < 2.0**63))
+        lacking = np.isnan(values)
+        wrong = np.flatnonzero(~(np.abs(values * scale) < 2.0**63) & ~lacking)
         if wrong.size:
             raise self._wrong(name, int(wrong[0]), f"{values[wrong[0]]:g}", "a time")
-        return np.rint(values * scale).astype(np.int64)
+        known = np.rint(np.where(lacking, 0.0, values) * scale).astype(np.int64)
+        return np.where(lacking, MISSING, known)
 
     def labels(self, name: str | None, else_: str) -> tuple[tuple[str, ...], Any]:
-        """Labels in order of appearance, and the number of each row's, shape (N,)."""
+        """Labels in order of appearance, and the number of each row's or ``MISSING``, (N,)."""
         if name is None:
             return (else_,), np.zeros(self._table.num_rows, np.int64)
-        words = np.array([str(value) for value in self._found(name).to_pylist()], object)
-        labels = tuple(dict.fromkeys(words))
-        return labels, np.array([labels.index(word) for word in words], np.int64)
+        words = [
+            "" if value is None or value != value else str(value).strip()
+            for value in self._found(name).to_pylist()
+        ]
+        numbers = {word: number for number, word in enumerate(dict.fromkeys(filter(None, words)))}
+        return tuple(numbers), np.array([numbers.get(word, MISSING) for word in words], np.int64)
 
     def _found(self, name: str) -> Any:
         if name not in self._table.column_names:
@@ -350,6 +363,10 @@ class _Reader:
             raise DatasetError(
                 f"{self._source} has no column {name!r}; it has: {there}",
                 remedy="say which columns are what: --columns MAP.toml, see docs/data.md",
+            )
+        if self._table.column_names.count(name) > 1:
+            raise DatasetError(
+                f"{self._source} has several columns {name!r}", remedy="give each its own name"
             )
         return self._table.column(name)
 
@@ -389,32 +406,53 @@ def _complete(
 ) -> npt.NDArray[np.bool_]:
     """Rows in which nothing is missing that must be there."""
     kept = np.ones(len(arrays["electrodes"]), np.bool_)
-    touching = arrays.get("in_contact", kept)
+    touching = arrays["in_contact"] == 1 if "in_contact" in arrays else kept.copy()
     for name, values in arrays.items():
         if values.ndim == 2:
             needed = touching if name in (*_LENGTHS, "contact_normal") else True
             lacking = ~np.isfinite(values).all(axis=1) & needed
-            if lacking.any() and not drop_incomplete:
-                raise DatasetError(
-                    f"{source}: {name} is not known in row {np.flatnonzero(lacking)[0]}"
-                    f" ({lacking.sum()} rows in all)",
-                    remedy="mend the table, or leave such rows out: --drop-incomplete",
-                )
-            kept &= ~lacking
+        else:
+            lacking = values == MISSING
+        if lacking.any() and not drop_incomplete:
+            raise DatasetError(
+                f"{source}: {name} is not known in row {np.flatnonzero(lacking)[0]}"
+                f" ({lacking.sum()} rows in all)",
+                remedy="mend the table, or leave such rows out: --drop-incomplete",
+            )
+        kept &= ~lacking
     if not kept.any():
         raise DatasetError(f"{source}: no row is complete", remedy="see which columns are empty")
     return kept
 
 
-def _counts(values: Values, source: Path) -> Values:
-    """Electrodes, as whole counts."""
+def _check_order(arrays: Mapping[str, Any], rows: npt.NDArray[np.int64], source: Path) -> None:
+    """Refuse a press whose rows are not in order of time; ``rows`` are those of the table.
+
+    Raises:
+        DatasetError: It is so: its neighbours in time might be learned from while it is tested.
+    """
+    order = np.lexsort((np.arange(len(rows)), arrays["group"], arrays["sensor"]))
+    same = np.ones(len(rows) - 1, np.bool_)
+    for name in ("sensor", "group"):
+        same &= np.diff(arrays[name][order]) == 0
+    back = np.flatnonzero(same & (np.diff(arrays["time_ns"][order]) < 0))
+    if back.size:
+        raise DatasetError(
+            f"{source}: row {rows[order[back[0] + 1]]} is earlier than the one before it of the"
+            f" same press ({back.size} rows in all)",
+            remedy="sort the table by sensor and time",
+        )
+
+
+def _counts(values: Values, rows: npt.NDArray[np.int64], source: Path) -> Values:
+    """Electrodes, as whole counts; ``rows`` are those of the table."""
     counts = np.rint(values)
     bad = np.abs(values - counts) > 1e-6
     bad |= (values < 0.0) | (values > COUNTS_MAX)
     if bad.any():
         row, electrode = (int(index) for index in np.argwhere(bad)[0])
         raise DatasetError(
-            f"{source}: E{electrode + 1} reads {values[row, electrode]:g} in row {row},"
+            f"{source}: E{electrode + 1} reads {values[row, electrode]:g} in row {rows[row]},"
             f" not whole counts from 0 to {COUNTS_MAX}",
             remedy="give raw counts as the BioTac sends them, nothing subtracted or scaled",
         )

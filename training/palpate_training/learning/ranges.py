@@ -152,6 +152,24 @@ def places_of(
     return distance / known.distance_max, compressed.mean(axis=1)
 
 
+def holds_known(known: KnownInputs, rows: npt.NDArray[np.floating]) -> bool:
+    """Whether rows ``(N, I)`` are of the training: a representative, which is a row of it, is here.
+
+    Representatives of which few values differ from zero tell nothing: untouched rows are alike.
+    """
+
+    def codes(compressed: npt.NDArray[np.floating]) -> list[bytes]:
+        # Rounded: processors differ in the last digit. Plus zero: there is a negative one, too.
+        return [row.tobytes() for row in (np.round(compressed, 4) + 0.0).astype(np.float32)]
+
+    telling = 2 * np.count_nonzero(known.prototypes, axis=1) > known.prototypes.shape[1]
+    own, scale = set(codes(known.prototypes[telling])), np.float32(known.scale)
+    return any(
+        not own.isdisjoint(codes(np.arcsinh(rows[first : first + _ROWS_AT_ONCE] / scale)))
+        for first in range(0, len(rows), _ROWS_AT_ONCE)
+    )
+
+
 def _products(
     rows: npt.NDArray[np.floating], scale: float, origin: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:

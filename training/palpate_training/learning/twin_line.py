@@ -94,12 +94,30 @@ def fit_line(data: FeatureDataset) -> TwinLine:
     return TwinLine(weight, mean - centre @ weight, data.content_sha256())
 
 
-def write_line(path: Path, line: TwinLine) -> None:
-    """Write it as JSON, whole or not at all.
+def check_place(path: Path) -> None:
+    """Refuse to write a line where something else is.
 
     Raises:
-        DatasetError: The disk refused.
+        DatasetError: The name does not end with .json, or there is a file that is no line.
     """
+    if path.suffix != ".json":
+        raise DatasetError(f"{path}: a line is written as JSON", remedy="give a name with .json")
+    if path.exists():
+        try:
+            read_line(path)
+        except DatasetError as error:
+            raise DatasetError(
+                f"{path} exists and is no line through a population", remedy="give another name"
+            ) from error
+
+
+def write_line(path: Path, line: TwinLine) -> None:
+    """Write it as JSON, whole or not at all; an earlier line is replaced.
+
+    Raises:
+        DatasetError: As ``check_place``, or the disk refused.
+    """
+    check_place(path)
     content = {
         "format": _FORMAT,
         "data_sha256": line.data_sha256,

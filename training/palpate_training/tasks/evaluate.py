@@ -17,7 +17,7 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate.files.bundle import Bundle, read_bundle
 from palpate.files.hdf5 import schema_of
-from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.container import Provenance, refuse_repeated
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
     MixedDataset,
@@ -31,6 +31,7 @@ from palpate_training.datasets.features import (
     FeatureDataset,
     FloatArray,
     open_dataset,
+    press_of,
 )
 from palpate_training.learning.contact_code import spread_forces_in_parts
 from palpate_training.learning.export import session_of
@@ -49,7 +50,7 @@ from palpate_training.learning.metrics import (
     root_mean,
 )
 from palpate_training.learning.splits import Rows
-from palpate_training.tasks.features import NORMAL
+from palpate_training.tasks.features import NORMAL, several
 from palpate_training.tasks.fields import tared_counts
 
 Floats = npt.NDArray[np.float64]
@@ -105,7 +106,8 @@ class Figure(NamedTuple):
         rows: How many.
         presses: Of how many presses.
         value: The error; NaN if no row has it.
-        low: Lower end of its 95 % confidence interval, presses drawn with replacement.
+        low: Lower end of its 95 % confidence interval, presses drawn with replacement; NaN of a
+            single press.
         high: Upper end.
         constant: The same of the best-known constant: the mean of these rows for what features are,
             nothing for fields and electrodes.
@@ -197,7 +199,8 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
 
     Raises:
         BundleError: The bundle breaks its contract.
-        DatasetError: A data set breaks its schema, has no such rows, or no unit is given.
+        DatasetError: A data set breaks its schema, has no such rows, or the same as another one;
+            or no unit is given.
     """
     bundle = read_bundle(folder)
     manifest = bundle.manifest
@@ -209,21 +212,25 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
     about: list[tuple[str, str]] = []
     digests: set[str] = set()
     parts: list[_Errors] = []
+    given: list[tuple[FloatArray, FloatArray]] = []
     for path in paths:
         if manifest.task == "features":
             data, provenance, digest = read_features(path)
+            given.append((data.tared_counts, data.force))
             digests.add(data.content_sha256())  # of a mixed file, whose features were learned from
             parts.append(_of_features(bundle, data, _rows_of_sensor(data, unit, path)))
         else:
             mixed = read_mixed(path)
             _check_mesh(bundle, mixed, path)
             experiment = mixed.experiment
+            given.append((experiment.tared, experiment.force))
             provenance, digest = experiment.provenance, content_sha256(mixed)
             rows = _rows_of_unit(experiment, unit, path)
             of = _of_field if manifest.task == "field" else _of_synthesis
             parts.append(of(bundle, mixed, rows))
         about.append((provenance.source, digest))
         digests.add(digest)
+    refuse_repeated(paths, given)
     errors = _joined(parts)
     return BundleErrors(
         bundle=f"{manifest.name} {manifest.version}",
@@ -257,11 +264,6 @@ def read_features(path: Path) -> tuple[FeatureDataset, Provenance, str]:
         return data, data.provenance, data.content_sha256()
     mixed = read_mixed(path)
     return features(mixed), mixed.experiment.provenance, content_sha256(mixed)
-
-
-def press_of(data: FeatureDataset) -> Labels:
-    """Press of each row; a recording that is a single group is told apart by its blocks."""
-    return data.group if len(np.unique(data.group)) > 1 else data.block
 
 
 def _rows_of_sensor(data: FeatureDataset, unit: str | None, path: Path) -> Rows:
@@ -404,7 +406,12 @@ def _figures(errors: _Errors) -> Iterator[Figure]:
         press = errors.press[rows]
         for name, found in errors.found.items():
             statistic = KINDS[name].of
-            ends = cluster_bootstrap({name: found[rows]}, press, statistic=statistic, draws=DRAWS)
+            # Of a single press nobody knows how far the next one is off.
+            ends = (
+                cluster_bootstrap({name: found[rows]}, press, statistic=statistic, draws=DRAWS)
+                if several(press)
+                else {name: (float("nan"), float("nan"))}
+            )
             yield Figure(
                 name,
                 where,

@@ -27,6 +27,7 @@ from palpate_training.datasets.features import (
     FeatureDataset,
     IndexArray,
     open_dataset,
+    press_of,
 )
 from palpate_training.learning import baselines
 from palpate_training.learning.export import export_features, refuse_existing
@@ -109,7 +110,8 @@ def train_features(
     refuse_existing(bundle_dir, name)
     where = training_device(device)
     data = open_dataset(dataset_path)
-    split = by_group(data.group, seed=seed)
+    press = press_of(data)
+    split = by_group(press, seed=seed)
     x = data.tared_counts
     of_contact = _of_contact(data)
     for side in (split.train, split.validation, split.test):
@@ -179,10 +181,10 @@ def train_features(
             tested[test, part],
             split.train[seen],
             split.test[test],
-            data.group,
+            press,
         )
 
-    trained = known_inputs(x[split.train], data.group[split.train])
+    trained = known_inputs(x[split.train], press[split.train])
     force_sd = _residual_sd(validated[:, :3], data.force[split.validation])
     graph = FeaturesGraph(net, force_sd, contact_sd)
     digest = export_features(
@@ -195,8 +197,8 @@ def train_features(
         training_data_sha256=data.content_sha256(),
         trained_on=(
             f"{data.provenance.source}: {len(split.train)} rows of"
-            f" {len(np.unique(data.group[split.train]))} presses; tested on"
-            f" {len(np.unique(data.group[split.test]))} other presses"
+            f" {len(np.unique(press[split.train]))} presses; tested on"
+            f" {len(np.unique(press[split.test]))} other presses"
         ),
         metrics=metrics,
         normalisation={
@@ -259,7 +261,7 @@ def _intervals(
             distance = location_errors(part, wanted[kept])["distance_m"]
             errors[quantity] = np.where(size >= threshold, distance, np.nan)
     distance, common = places_of(seen, data.tared_counts[kept])
-    press = data.group[kept]
+    press = press_of(data)[kept]
     return Intervals(
         LEVEL,
         f"{len(kept)} rows of {len(np.unique(press))} presses that training has not seen, of"
@@ -318,8 +320,8 @@ def _force_report(
             metrics[f"{model}_{key}"] = baseline[key]
     errors = force_errors(estimate[touching], truth[touching])
     wanted = {key: errors[key] for key in ("magnitude_n", "angle_rad")}
-    presses = data.group[split.test][touching]
-    ends = cluster_bootstrap(wanted, presses) if _several(presses) else {}
+    presses = press_of(data)[split.test][touching]
+    ends = cluster_bootstrap(wanted, presses) if several(presses) else {}
     for key, (low, high) in ends.items():
         quantity, unit = key.split("_")
         metrics[f"force_{quantity}_median_ci95_low_{unit}"] = low
@@ -370,13 +372,13 @@ def _contact_report(
             else location_errors(other, truth)["distance_m"]
         )
         metrics[f"{model}_{headline}"] = float(np.median(others))
-    if _several(group[test_on]):
+    if several(group[test_on]):
         ends = cluster_bootstrap({"error": errors}, group[test_on])
         stem, _, unit = headline.rpartition("_")
         metrics[f"{stem}_ci95_low_{unit}"], metrics[f"{stem}_ci95_high_{unit}"] = ends["error"]
     return metrics
 
 
-def _several(press: npt.NDArray[np.integer]) -> bool:
+def several(press: npt.NDArray[np.integer]) -> bool:
     """Whether there is more than one press, without which nothing tells how sure an error is."""
     return len(np.unique(press)) > 1

@@ -19,14 +19,15 @@ from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import Bundle, read_bundle, write_bundle
 from palpate.files.intervals import BoundFormula, Intervals
 from palpate.files.training_range import KnownInputs
+from palpate_training.datasets.container import refuse_repeated
 from palpate_training.datasets.experiment import MixedDataset, content_sha256, read_mixed
-from palpate_training.datasets.features import FeatureDataset, FloatArray, open_dataset
+from palpate_training.datasets.features import FeatureDataset, FloatArray, open_dataset, press_of
 from palpate_training.learning.export import refuse_existing
 from palpate_training.learning.field_code import in_parts
 from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
 from palpate_training.learning.metrics import field_errors, force_errors, join, location_errors
-from palpate_training.learning.ranges import UNLIKE, places_of, with_pattern
-from palpate_training.tasks.evaluate import answers_of, press_of, read_features
+from palpate_training.learning.ranges import UNLIKE, holds_known, places_of, with_pattern
+from palpate_training.tasks.evaluate import answers_of, read_features
 from palpate_training.tasks.fields import tared_counts
 
 Floats = npt.NDArray[np.float64]
@@ -123,7 +124,8 @@ def add_intervals(
 
     Raises:
         BundleError: It breaks its contract, knows no training rows, or ``out`` exists.
-        DatasetError: A data set breaks its schema, holds too few presses, or was trained on.
+        DatasetError: A data set breaks its schema, holds too few presses, those of another one, or
+            was trained on.
     """
     refuse_existing(out)
     bundle = read_bundle(old)
@@ -136,13 +138,17 @@ def add_intervals(
             " upgrade",
         )
     sets = [read_held_out(bundle, path) for path in held_out]
+    refuse_repeated(held_out, [(one.rows.tared, one.rows.force_n[:, None]) for one in sets])
     found = joined([one.rows for one in sets])
     presses = len(np.unique(found.press))
-    if any(one.sha256 == manifest.training_data_sha256 for one in sets):
-        raise DatasetError(
-            f"{old} was trained on one of {', '.join(map(str, held_out))}",
-            remedy="take presses that no training has seen",
-        )
+    for path, one in zip(held_out, sets, strict=True):
+        if one.sha256 == manifest.training_data_sha256 or holds_known(
+            bundle.known_inputs, one.rows.tared
+        ):
+            raise DatasetError(
+                f"{old} was trained on presses of {path}",
+                remedy="take presses that no training has seen",
+            )
     if presses < PRESSES_LEAST:
         raise DatasetError(
             f"{', '.join(map(str, held_out))}: {presses} presses, {PRESSES_LEAST} are needed",

@@ -16,7 +16,7 @@ import numpy as np
 
 from palpate.errors import DatasetError
 from palpate_training.datasets.container import add_array
-from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.features import FeatureDataset, of_sensor
 from palpate_training.learning.export import refuse_existing
 from palpate_training.learning.force_process import Floats, KnownRows
 from palpate_training.learning.other_fingers import OtherFinger, OtherFingers
@@ -40,12 +40,9 @@ def fingers_in(data: FeatureDataset) -> list[OtherFinger]:
     """
     found = []
     for number, name in enumerate(data.sensor_names):
-        own = data.sensor == number
-        if not own.any():
+        if not (data.sensor == number).any():
             continue
-        columns = {column: values[own] for column, values in data.arrays().items()}
-        columns["sensor"] = np.zeros(own.sum(), np.int32)
-        one = replace(data, **columns, sensor_names=(name,), name=f"{data.name}, {name}")
+        one = of_sensor(data, name)
         rest = one.baseline.mean(axis=0, dtype=np.float64)
         found.append(OtherFinger(name, known_rows(one)[0], rest))
     return found
