@@ -157,8 +157,12 @@ def issue(
     return target
 
 
-def read_certificate(tls: TlsConfig) -> IssuedCertificate:
+def read_certificate(tls: TlsConfig, *, private: bool = True) -> IssuedCertificate:
     """What a certificate says, and whether it holds.
+
+    Args:
+        tls: Its files.
+        private: Whether it is a problem, too, that others than its owner may read the key.
 
     Raises:
         ConfigError: Its files cannot be read, or are no certificate and key.
@@ -167,6 +171,8 @@ def read_certificate(tls: TlsConfig) -> IssuedCertificate:
     common = _first(certificate.subject, NameOID.COMMON_NAME)
     role = ROLE_OF.get(common)
     problem = _problem(certificate, tls)
+    if not problem and private and stat.S_IMODE(tls.private_key.stat().st_mode) & 0o077:
+        problem = f"others than its owner may read the key: chmod 600 {tls.private_key}"
     if not problem and tls.roles and role is None:
         problem = f"its common name {common!r} is no role"
     return IssuedCertificate(
@@ -210,8 +216,6 @@ def _problem(certificate: x509.Certificate, tls: TlsConfig) -> str:
             return (
                 f"{what} begins on {one.not_valid_before_utc:%Y-%m-%d %H:%M} UTC: check the clock"
             )
-    if stat.S_IMODE(tls.private_key.stat().st_mode) & 0o077:
-        return f"others than its owner may read the key: chmod 600 {tls.private_key}"
     return ""
 
 
