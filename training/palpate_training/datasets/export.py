@@ -222,7 +222,7 @@ def features(
                 f" ({unknown.sum()} of {data.trials} trials)",
                 remedy="state the rest to assume: --assumed-rest 3300",
             )
-        change = data.tared[unknown[data.trial]] * COUNTS_MAX
+        change = data.tared[np.isin(data.trial, np.flatnonzero(unknown))] * COUNTS_MAX
         low, high = np.ceil(-change.min()), np.floor(COUNTS_MAX - change.max())
         if not low <= assumed_rest <= high:
             raise DatasetError(
