@@ -139,6 +139,13 @@ def test_doctor_warns_before_the_end(profile: Path, lab: Path) -> None:
     found = _doctor(profile)
     assert found["grade"] == "warn"
     assert "palpate certs issue" in found["fix"]
+    shutil.rmtree(lab)
+    make_authority(lab, days=10)
+    for role in ("router", "gateway", "service"):
+        _run("certs", "issue", lab, "--role", role)
+    found = _doctor(profile)
+    assert found["grade"] == "warn"
+    assert "palpate certs ca" in found["fix"]
 
 
 def test_doctor_names_what_is_wrong(profile: Path, lab: Path, tmp_path: Path) -> None:

@@ -167,6 +167,9 @@ def _certificates(profile: Profile) -> Found:
     first = min(ours, key=lambda one: one.until)
     roles = dict.fromkeys(role_of(service) for service in profile.processes)
     found = f"{', '.join(roles)}: the first of them ends on {first.until:%Y-%m-%d}"
+    if first.authority_ends:
+        fix = "their authority ends: make a new one in another folder, and issue all of them again"
+        return "warn", found, f"{fix}: palpate certs ca"
     if first.days_left < WARN_DAYS:
         return "warn", found, "issue new ones: palpate certs issue, and start the station again"
     return "ok", found, ""
