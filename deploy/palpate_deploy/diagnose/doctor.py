@@ -139,7 +139,30 @@ def _sensors(profile: Profile) -> Found:
         if path is not None and not Path(str(path)).is_file():
             return "fail", f"sensor {sensor.name!r}: {path} does not exist", "set its path"
         names.append(f"{sensor.name} ({sensor.driver})")
-    return "ok", ", ".join(names), ""
+    found = ", ".join(names)
+    if strange := _unserved(profile):
+        return (
+            "warn",
+            f"{found}; of no gateway of this host: {', '.join(strange)}",
+            "correct the names in `sensors` and `bundles` of the services, or listen for the "
+            "gateways of other hosts: [router] listen",
+        )
+    return "ok", found, ""
+
+
+def _unserved(profile: Profile) -> list[str]:
+    """Sensors that the services of a station of this host alone name, and its gateway has not."""
+    if not all(is_loopback(endpoint_host_port(one)[0]) for one in profile.router.listen):
+        return []
+    has = {sensor.name for sensor in profile.gateway.sensors}
+    named = [
+        f"{sensor} ([{service}])"
+        for service, table in (("features", profile.features), ("field", profile.field))
+        if service in profile.processes
+        for sensor in dict.fromkeys([*table.sensors, *table.bundles])
+        if sensor not in has
+    ]
+    return named if "router" in profile.processes else []
 
 
 def _router(profile: Profile) -> Found:
