@@ -69,7 +69,7 @@ class Health:
         self._counters: Counter[str] = Counter()
         self._gauges: dict[str, float] = {}
         self._state = ServiceState.STARTING
-        self._message = ""
+        self._message = self._state_message = ""
         self._last_error: ErrorReply | None = None
         self._recovery: tuple[float, str] | None = None  # since when all is well, and the message
         self._sensors: tuple[str, ...] = ()
@@ -151,10 +151,17 @@ class Health:
             self._last_error = told
             self._message = error.problem
             if degraded:
+                self._state_message = error.problem
                 new = new or self._state is not ServiceState.DEGRADED
                 self._state, self._recovery = ServiceState.DEGRADED, None
         if new:
             self.tell()
+
+    def over(self, error: PalpateError) -> None:
+        """An error that did not degrade is over: the message is that of the state again."""
+        with self._lock:
+            if self._message == error.problem:
+                self._message = self._state_message
 
     def set_state(self, state: ServiceState, message: str = "") -> None:
         """Set the state of this process; from DEGRADED it is READY after ``RECOVERY_S`` only."""
@@ -165,7 +172,8 @@ class Health:
                 self._wake_by(since_s + RECOVERY_S)
                 return
             different = state is not self._state
-            self._state, self._message, self._recovery = state, message, None
+            self._state, self._recovery = state, None
+            self._message = self._state_message = message
         if different:
             self.tell()
 
@@ -187,8 +195,8 @@ class Health:
             if self._recovery is not None:
                 since_s, message = self._recovery
                 if now_s >= since_s + RECOVERY_S:
-                    self._state, self._message = ServiceState.READY, message
-                    self._recovery = None
+                    self._state, self._recovery = ServiceState.READY, None
+                    self._message = self._state_message = message
                     self.tell()
                 else:
                     left.append(since_s + RECOVERY_S - now_s)

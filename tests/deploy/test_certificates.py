@@ -26,6 +26,7 @@ from palpate.errors import ConfigError
 from palpate_deploy.cli.app import app
 from palpate_deploy.station import certificates
 from palpate_deploy.station.certificates import issue, make_authority, read_certificate
+from palpate_deploy.station.processes import check_certificates
 from palpate_deploy.station.profile import load_profile
 
 
@@ -138,6 +139,13 @@ def test_doctor_warns_before_the_end(profile: Path, lab: Path) -> None:
     found = _doctor(profile)
     assert found["grade"] == "warn"
     assert "palpate certs issue" in found["fix"]
+    shutil.rmtree(lab)
+    make_authority(lab, days=10)
+    for role in ("router", "gateway", "service"):
+        _run("certs", "issue", lab, "--role", role)
+    found = _doctor(profile)
+    assert found["grade"] == "warn"
+    assert "palpate certs ca" in found["fix"]
 
 
 def test_doctor_names_what_is_wrong(profile: Path, lab: Path, tmp_path: Path) -> None:
@@ -163,6 +171,24 @@ def test_doctor_names_what_is_wrong(profile: Path, lab: Path, tmp_path: Path) ->
     assert "others than its owner may read" in wrong()
     (lab / "gateway" / "key.pem").write_text("no key")
     assert "no private key" in wrong()
+
+
+def test_no_station_starts_with_certificates_that_nobody_accepts(
+    profile: Path, lab: Path, tmp_path: Path
+) -> None:
+    make_authority(tmp_path / "other")
+    shutil.copy(tmp_path / "other" / "ca.pem", lab / "gateway" / "ca.pem")
+    said = _run("up", "--profile", profile, code=2)
+    assert _doctor(profile)["found"] in " ".join(said.split())
+    shutil.copy(lab / "ca.pem", lab / "gateway" / "ca.pem")
+    (lab / "gateway" / "key.pem").write_text("")
+    assert "no private key" in _run("up", "--profile", profile, code=2)
+    (lab / "service" / "key.pem").chmod(0o440)
+    shutil.rmtree(lab / "gateway")
+    _run("certs", "issue", lab, "--role", "gateway")
+    assert len(check_certificates(load_profile(profile), private=False)) == 3
+    with pytest.raises(ConfigError, match="others than its owner"):
+        check_certificates(load_profile(profile), private=True)
 
 
 def test_a_station_of_this_host_alone_needs_none() -> None:

@@ -253,6 +253,18 @@ def test_doctor_warns_where_the_disk_cannot_hold_what_is_kept(tmp_path: Path) ->
     assert grade == "ok"
 
 
+def test_doctor_warns_of_sensors_that_no_gateway_has() -> None:
+    base = load_profile("virtual")
+    assert doctor._sensors(base)[0] == "ok"
+    strange = changed(base, features={"sensors": ["finger", "thumb"], "bundles": {"toe": "a"}})
+    grade, found, fix = doctor._sensors(strange)
+    assert grade == "warn"
+    assert "thumb ([features]), toe ([features])" in found
+    assert fix
+    alone = strange.model_copy(update={"processes": ("router", "gateway")})
+    assert doctor._sensors(alone)[0] == "ok"
+
+
 def test_doctor_looks_for_all_that_simulations_need() -> None:
     looked_for = {module for module, _, _ in doctor._PACKAGES}
     assert set(EXTRA_MODULES) <= looked_for

@@ -89,6 +89,19 @@ def test_exposed_router_without_tls_is_refused(tmp_path: Path) -> None:
         load_profile(path)
 
 
+@pytest.mark.parametrize(
+    ("listen", "says"),
+    [
+        ("[]", "listen is empty"),
+        ('["tcp/127.0.0.1:0"]', "no port"),
+        ('["tls/127.0.0.1:7447"]', r"needs certificates.*\[link\] certificates"),
+    ],
+)
+def test_router_that_nobody_can_reach_is_refused(tmp_path: Path, listen: str, says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        load_profile(_write(tmp_path, f"[router]\nlisten = {listen}"))
+
+
 def test_router_port_is_said_once(tmp_path: Path) -> None:
     """Who starts the router connects to it, unless told otherwise."""
     path = _write(tmp_path, '[router]\nlisten = ["tcp/127.0.0.1:9000"]')

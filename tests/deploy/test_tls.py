@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import datetime
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +24,7 @@ from palpate.config import LinkConfig, Role, endpoint_host_port, is_loopback
 from palpate.errors import ConfigError, LinkError
 from palpate.health import Health, HealthReporter
 from palpate_deploy.cli.app import app
+from palpate_deploy.station import certificates as issuing
 from palpate_deploy.station.certificates import issue, make_authority
 
 LIVE_S = 20.0
@@ -64,8 +67,19 @@ def test_a_client_joins_with_its_certificates_only(
         assert robot.session.has_router()
     make_authority(tmp_path / "other")
     stranger = issue(tmp_path / "other", Role.ROBOT)
-    with pytest.raises(LinkError):
+    with pytest.raises(LinkError, match="does not hold here"):
         Client(station, tls=stranger, timeout_s=1.0)
+    shutil.copy(own / "ca.pem", stranger / "ca.pem")
+    with pytest.raises(LinkError, match=r"refuses the certificate .*cert\.pem: \w+"):
+        Client(station, tls=stranger, timeout_s=1.0)
+    before = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=3)
+    monkeypatch.setattr(issuing, "_now", lambda: before)
+    ended = issue(certificates, Role.ROBOT, "ended", days=1)
+    with pytest.raises(LinkError, match=r"refuses the certificate .*expired"):
+        Client(station, tls=ended, timeout_s=1.0)
+    plain = LinkConfig(connect=(station.replace("tls/", "tcp/"),), wait_for_router_s=1.0)
+    with pytest.raises(LinkError, match=r"something listens .* -> connect to tls/"):
+        Session.open(plain)
     (stranger / "cert.pem").unlink()
     with pytest.raises(ConfigError, match=r"cert\.pem does not exist"):
         Client(station, tls=stranger)

@@ -254,7 +254,8 @@ def test_options_at_their_defaults_are_no_difference(own_bus: LinkConfig) -> Non
 
 
 def test_who_may_not_answer_says_so_once(own_bus: LinkConfig) -> None:
-    stop, told = threading.Event(), []
+    stop = threading.Event()
+    told: list[PalpateError] = []
     values = {**FAKES, "fingertip": {"shear_modulus_pa": 3.0e5}}
     with (
         thread(own_bus, "fem-a"),

@@ -6,8 +6,9 @@ import logging
 
 import pytest
 
-from palpate.errors import DeviceLost
+from palpate.errors import DeviceError, DeviceLost
 from palpate.health import Health
+from palpate.messages import ServiceState
 from palpate_gateway.service.sensor_report import SensorReport
 
 
@@ -26,3 +27,19 @@ def test_a_sensor_that_stays_away_is_logged_once_for_each_reason(
         report.delivers(None, zero_lost=False)
         report.is_lost(pulled, 0.4)
     assert caplog.text.count("the line is gone") == 3
+
+
+def test_a_refused_tare_is_the_message_until_one_succeeds() -> None:
+    health = Health("gateway", "a")
+    report = SensorReport("thumb", health)
+    health.set_state(ServiceState.READY, "all sensors deliver")
+    for _ in range(2):
+        report.tare_refused(None)
+        report.tare_refused(DeviceError("the finger is touched", remedy="let go"))
+        assert health.status().message == "the finger is touched"
+        report.tare_refused(None)
+        assert health.status().message == "all sensors deliver"
+    report.tare_refused(DeviceError("the finger is touched", remedy="let go"))
+    health.fail(DeviceLost("the line is gone", remedy="plug it in"))
+    report.tare_refused(None)
+    assert health.status().message == "the line is gone"

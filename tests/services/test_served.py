@@ -89,6 +89,14 @@ def test_the_profile_chooses_for_all_and_for_single_sensors(service: Service) ->
     assert started.metadata().version == 3
 
 
+def test_a_profile_that_names_a_bundle_of_another_task_is_wrong() -> None:
+    settings = FeaturesServiceConfig(bundle="field-twin")
+    with pytest.raises(
+        ConfigError, match=r"'field-twin'.* is for the task 'field', not 'features'"
+    ):
+        ServedModels("features", settings, Repository(None))
+
+
 def test_load_and_roll_back_and_forth(service: Service, models: Path) -> None:
     started = service()
     before = started.of("any")

@@ -217,6 +217,15 @@ def test_blocks_of_a_single_group_are_its_presses(press_data: MakeData, tmp_path
     assert "force_magnitude_median_ci95_low_n" in manifest.metrics
 
 
+def test_forces_that_never_change_are_refused_before_training(
+    press_data: MakeData, tmp_path: Path
+) -> None:
+    data = press_data(presses=6)
+    write_dataset(tmp_path / "still.h5", replace(data, force=np.ones_like(data.force)))
+    with pytest.raises(DatasetError, match="force is the same in all 360 rows"):
+        train_features(tmp_path / "still.h5", tmp_path / "bundle", config=QUICK)
+
+
 def test_too_few_presses_are_named(press_data: MakeData, tmp_path: Path) -> None:
     write_dataset(tmp_path / "two.h5", press_data(presses=2))
     with pytest.raises(DatasetError, match="2 groups"):

@@ -24,6 +24,7 @@ from palpate_training.tasks import finger
 from palpate_training.tasks.finger import (
     STEPS,
     TOLD,
+    HeldOutPresses,
     chosen,
     estimate_of,
     known_rows,
@@ -140,6 +141,32 @@ def test_what_is_said_of_it_comes_from_presses_that_were_held_out(
     found = train_finger(invented, tmp_path / "b", name="features-mine").metrics
     assert found["force_magnitude_median_n"] > 0.5 * found["constant_force_magnitude_median_n"]
     assert found["coverage_90"] >= 0.8
+
+
+def test_intervals_are_told_by_presses_that_did_not_set_them() -> None:
+    """One press in six is ten times as wrong as the others: nothing in them says so."""
+    press = np.repeat(np.arange(6), 10)
+    force = np.tile([0.0, 0.0, 2.0], (60, 1))
+    rows = KnownRows(np.zeros((60, 19)), force, press)
+    wrong = np.where(press == 3, 1.0, 0.1)[:, None] * np.ones(3)
+    said = HeldOutPresses.of(force + wrong, rows, np.ones(60, bool), {})
+    assert said.metrics["coverage_90"] == pytest.approx(5 / 6)
+    assert (1.645 * said.force_sd >= 0.99).all(), "the width itself knows all presses"
+
+
+def test_what_never_changes_is_refused(press_data: MakeData, tmp_path: Path) -> None:
+    data = press_data(presses=8)
+    still = replace(data, force=np.full_like(data.force, 2.0))
+    with pytest.raises(DatasetError, match="force is the same in all 480 rows"):
+        train_finger(still, tmp_path / "b", name="features-mine")
+    dead = replace(data, electrodes=data.electrodes[:1].repeat(len(data), axis=0))
+    with pytest.raises(DatasetError, match="electrodes, tared, is the same in all 480 rows"):
+        train_finger(dead, tmp_path / "b", name="features-mine")
+    absurd = data.force.copy()
+    absurd[7, 1] = 1e30
+    with pytest.raises(DatasetError, match=r"force y is 1e\+30 N in row 7"):
+        train_finger(replace(data, force=absurd), tmp_path / "b", name="features-mine")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_recording_without_presses_counts_its_blocks(press_data: MakeData) -> None:

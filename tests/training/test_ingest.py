@@ -75,6 +75,8 @@ def test_lasa_takes_whatever_fingers_an_archive_holds(lasa_archive: Path, tmp_pa
     np.testing.assert_array_equal(one.electrodes, arrays["finger1_electrodes_raw"])
     with pytest.raises(DatasetError, match="finger1_electrodes_raw"):
         ingest_lasa(tmp_path / "others.npz", fingers=(1, 2))
+    with pytest.raises(DatasetError, match="named twice: 12, 12"):
+        ingest_lasa(tmp_path / "others.npz", fingers=(12, 12))
 
 
 @pytest.mark.parametrize("rows", [0, 21])
@@ -154,17 +156,17 @@ class Record:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.messages: list[tuple[Topic, object]] = []  # type: ignore[type-arg]
+        self.messages: list[tuple[Topic, str, object]] = []  # type: ignore[type-arg]
 
-    def add(self, topic: Topic, *messages: object) -> Record:  # type: ignore[type-arg]
-        self.messages += [(topic, message) for message in messages]
+    def add(self, topic: Topic, *messages: object, of: str = "finger") -> Record:  # type: ignore[type-arg]
+        self.messages += [(topic, of, message) for message in messages]
         return self
 
     def write(self) -> Path:
         with RecordWriter(self.path) as writer:
-            for i, (topic, message) in enumerate(self.messages):
+            for i, (topic, sensor, message) in enumerate(self.messages):
                 writer.write(
-                    sensor_key("lab", "finger", topic.name),
+                    sensor_key("lab", sensor, topic.name),
                     topic.codec.schema,
                     topic.codec.encode(message),
                     log_time_ns=i,
@@ -216,6 +218,17 @@ def test_where_a_robot_cannot_know_whether_it_touches_the_force_says_so(record: 
     np.testing.assert_array_equal(data.in_contact, pressing)
     np.testing.assert_array_equal(np.isnan(data.contact_location[:, 0]), ~np.array(pressing))
     np.testing.assert_array_equal(np.unique(data.group), [0, 1])
+
+
+def test_a_finger_without_poses_takes_no_location_in_silence(record: Record) -> None:
+    for name in ("finger", "thumb"):
+        record.add(TARE, tare(1, 2000.0), of=name)
+        record.add(ELECTRODES, *(frame(i + 1) for i in range(20)), of=name)
+        record.add(WRENCH, *(wrench(i + 1) for i in range(20)), of=name)
+    record.add(POSE, *(pose(i + 1, touches=True) for i in range(20)))
+    data = ingest_record(record.write())
+    assert data.contact_location is None
+    assert "no contact locations, because thumb has no pose" in data.provenance.notes
 
 
 def test_record_drops_what_cannot_be_used(record: Record) -> None:

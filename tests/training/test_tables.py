@@ -59,7 +59,7 @@ def test_a_table_comes_back_as_it_was(data: FeatureDataset, tmp_path: Path, csv:
         pairs = np.unique(labels, axis=1).T
         assert len(pairs) == len(np.unique(labels[0])) == len(np.unique(labels[1]))
     assert back.provenance.notes == "palpate's own columns"
-    assert back.provenance.licence == ("not stated" if csv else "free")
+    assert (back.provenance.source, back.provenance.licence) == ("invented", "free")
     with pytest.raises(DatasetError, match="exists"):
         export_table(path, data, csv=csv)
 
@@ -168,6 +168,7 @@ def test_incomplete_rows_are_left_out_only_if_that_is_said(data: FeatureDataset)
         found = dataset_of(lacking, columns, source=Path("x"), drop_incomplete=True)
         assert len(found) == len(data) - 1
         assert found.sensor_names == data.sensor_names
+        assert data.time_ns is not None
         np.testing.assert_array_equal(found.time_ns, np.delete(data.time_ns, 4))
 
 

@@ -16,7 +16,8 @@ from palpate_training.cli import data_app, train_app
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks, write_dataset
 from palpate_training.datasets.ingest import ingest_lasa
 from palpate_training.learning.fit import FeaturesFitConfig
-from palpate_training.tasks import force_real
+from palpate_training.tasks import features, force_real
+from palpate_training.tasks.features import FeaturesReport
 from palpate_training.tasks.force_real import (
     experiment_count,
     run_force_real,
@@ -63,6 +64,26 @@ def test_inspect_shows_units_and_provenance(press_data: MakeData, tmp_path: Path
 @pytest.mark.parametrize("app", [train_app, data_app])
 def test_help(app: object) -> None:
     assert CliRunner().invoke(app, ["--help"]).exit_code == 0  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("out", "options", "version"),
+    [("2", [], 2), ("mine", [], 1), ("0", [], 1), ("2", ["--version", "3"], 3)],
+)
+def test_a_bundle_has_the_version_that_its_folder_is_called(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, out: str, options: list[str], version: int
+) -> None:
+    asked: list[int] = []
+
+    def train(*_: object, version: int, **__: object) -> FeaturesReport:
+        asked.append(version)
+        return FeaturesReport(b"", {}, (1, 1, 1))
+
+    monkeypatch.setattr(features, "train_features", train)
+    arguments = ["features", "--data", "rows.h5", "--out", str(tmp_path / out), *options]
+    result = CliRunner().invoke(train_app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert asked == [version]
 
 
 def test_experiment_reports_every_model_beside_the_baselines(

@@ -216,6 +216,14 @@ def test_an_unknown_rest_must_be_assumed_by_the_user(experiment: ExperimentDatas
     rows = features(data, assumed_rest=3300)
     np.testing.assert_array_equal(rows.baseline[rows.group == 1], 3300)
     np.testing.assert_array_equal(rows.baseline[:4], np.tile(rest[0], (4, 1)))
+    with pytest.raises(
+        DatasetError, match="with a rest of 100 counts electrodes read from -"
+    ) as no:
+        features(data, assumed_rest=100)
+    lowest = int(no.value.remedy.split()[4])
+    assert features(data, assumed_rest=lowest).electrodes.min() == 0
+    with pytest.raises(DatasetError, match="with a rest of"):
+        features(data, assumed_rest=lowest - 1)
 
 
 def test_a_subset_holds_these_trials_alone(experiment: ExperimentDataset) -> None:

@@ -77,8 +77,19 @@ def test_what_was_exported_is_read_back(folder: Path, source: ExperimentDataset)
             == (source.indenters[source.trial_trajectory[other]])
         )
     assert np.isnan(read.trial_rest).all()
-    assert "biotac1.hdf5" in read.provenance.source
+    assert read.provenance.source == source.provenance.source
+    assert read.provenance.licence == source.provenance.licence
     assert len(read.provenance.input_sha256) == 64
+
+
+def test_files_that_say_nothing_are_the_publishers(folder: Path) -> None:
+    for path in folder.iterdir():
+        with h5py.File(path, "r+") as file:
+            for name in list(file.attrs):
+                del file.attrs[name]
+    said = read_published(folder).provenance
+    assert "published experiment of Narang et al.: biotac1.hdf5" in said.source
+    assert said.licence.startswith("the publisher's")
 
 
 def test_trials_of_one_trajectory_share_its_id_over_units(

@@ -19,10 +19,10 @@ from rich.console import Console
 
 from palpate.config import endpoint_host_port, is_loopback
 from palpate.errors import LinkError, PalpateError
-from palpate.process import check_installed, state_folder
+from palpate.process import state_folder
 from palpate_deploy.station.host import check_free, join
 from palpate_deploy.station.logs import FAILED
-from palpate_deploy.station.processes import check_packages, role_of
+from palpate_deploy.station.processes import check_certificates, check_packages, role_of
 from palpate_deploy.station.profile import Profile, load_profile
 
 Grade = Literal["ok", "warn", "fail"]
@@ -139,7 +139,30 @@ def _sensors(profile: Profile) -> Found:
         if path is not None and not Path(str(path)).is_file():
             return "fail", f"sensor {sensor.name!r}: {path} does not exist", "set its path"
         names.append(f"{sensor.name} ({sensor.driver})")
-    return "ok", ", ".join(names), ""
+    found = ", ".join(names)
+    if strange := _unserved(profile):
+        return (
+            "warn",
+            f"{found}; of no gateway of this host: {', '.join(strange)}",
+            "correct the names in `sensors` and `bundles` of the services, or listen for the "
+            "gateways of other hosts: [router] listen",
+        )
+    return "ok", found, ""
+
+
+def _unserved(profile: Profile) -> list[str]:
+    """Sensors that the services of a station of this host alone name, and its gateway has not."""
+    if not all(is_loopback(endpoint_host_port(one)[0]) for one in profile.router.listen):
+        return []
+    has = {sensor.name for sensor in profile.gateway.sensors}
+    named = [
+        f"{sensor} ([{service}])"
+        for service, table in (("features", profile.features), ("field", profile.field))
+        if service in profile.processes
+        for sensor in dict.fromkeys([*table.sensors, *table.bundles])
+        if sensor not in has
+    ]
+    return named if "router" in profile.processes else []
 
 
 def _router(profile: Profile) -> Found:
@@ -159,33 +182,17 @@ def _router(profile: Profile) -> Found:
 
 
 def _certificates(profile: Profile) -> Found:
-    link = profile.link
-    if not link.has_tls:
+    ours = check_certificates(profile, private=True)
+    if not ours:
         return "ok", "none: this station is reached from this host only", ""
-    check_installed("cryptography", extra="security")
-    from palpate_deploy.station.certificates import (
-        WARN_DAYS,
-        IssuedCertificate,
-        read_certificate,
-    )
+    from palpate_deploy.station.certificates import WARN_DAYS
 
-    roles = list(dict.fromkeys(role_of(service) for service in profile.processes))
-    ours: list[IssuedCertificate] = []
-    for role in roles:
-        tls = link.as_role(role).tls
-        assert tls is not None
-        one = read_certificate(tls)
-        if one.problem:
-            return "fail", f"{tls.certificate}: {one.problem}", "issue another: palpate certs issue"
-        if tls.roles and one.role is not role:
-            wrong = f"{tls.certificate} is that of a {one.role}, a {role} needs its own"
-            return "fail", wrong, "make a folder for each role: [link] certificates"
-        if ours and one.authority != ours[0].authority:
-            wrong = f"{tls.certificate} and {ours[0].folder} are of different authorities"
-            return "fail", wrong, "issue all of them by one: palpate certs issue"
-        ours.append(one)
     first = min(ours, key=lambda one: one.until)
+    roles = dict.fromkeys(role_of(service) for service in profile.processes)
     found = f"{', '.join(roles)}: the first of them ends on {first.until:%Y-%m-%d}"
+    if first.authority_ends:
+        fix = "their authority ends: make a new one in another folder, and issue all of them again"
+        return "warn", found, f"{fix}: palpate certs ca"
     if first.days_left < WARN_DAYS:
         return "warn", found, "issue new ones: palpate certs issue, and start the station again"
     return "ok", found, ""

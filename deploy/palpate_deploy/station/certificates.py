@@ -63,6 +63,7 @@ class IssuedCertificate:
         hosts: Names and addresses at which its holder may listen.
         until: When it ends, UTC.
         authority: SHA-256 of the certificate of its authority, 32 bytes.
+        authority_until: When its authority ends, UTC.
         problem: Why nobody will accept it, or that others may read its key; empty = all is well.
     """
 
@@ -72,7 +73,13 @@ class IssuedCertificate:
     hosts: tuple[str, ...]
     until: datetime.datetime
     authority: bytes
+    authority_until: datetime.datetime
     problem: str = ""
+
+    @property
+    def authority_ends(self) -> bool:
+        """Whether one that its authority issues now would end soon, too."""
+        return self.authority_until - _now() < datetime.timedelta(days=WARN_DAYS)
 
     @property
     def days_left(self) -> float:
@@ -157,16 +164,23 @@ def issue(
     return target
 
 
-def read_certificate(tls: TlsConfig) -> IssuedCertificate:
+def read_certificate(tls: TlsConfig, *, private: bool = True) -> IssuedCertificate:
     """What a certificate says, and whether it holds.
+
+    Args:
+        tls: Its files.
+        private: Whether it is a problem, too, that others than its owner may read the key.
 
     Raises:
         ConfigError: Its files cannot be read, or are no certificate and key.
     """
     certificate = _read_pem(tls.certificate)
+    authority = _read_pem(tls.root_ca_certificate)
     common = _first(certificate.subject, NameOID.COMMON_NAME)
     role = ROLE_OF.get(common)
     problem = _problem(certificate, tls)
+    if not problem and private and stat.S_IMODE(tls.private_key.stat().st_mode) & 0o077:
+        problem = f"others than its owner may read the key: chmod 600 {tls.private_key}"
     if not problem and tls.roles and role is None:
         problem = f"its common name {common!r} is no role"
     return IssuedCertificate(
@@ -175,7 +189,8 @@ def read_certificate(tls: TlsConfig) -> IssuedCertificate:
         _first(certificate.subject, NameOID.ORGANIZATIONAL_UNIT_NAME) or common,
         _hosts(certificate),
         certificate.not_valid_after_utc,
-        _read_pem(tls.root_ca_certificate).fingerprint(hashes.SHA256()),
+        authority.fingerprint(hashes.SHA256()),
+        authority.not_valid_after_utc,
         problem,
     )
 
@@ -210,8 +225,6 @@ def _problem(certificate: x509.Certificate, tls: TlsConfig) -> str:
             return (
                 f"{what} begins on {one.not_valid_before_utc:%Y-%m-%d %H:%M} UTC: check the clock"
             )
-    if stat.S_IMODE(tls.private_key.stat().st_mode) & 0o077:
-        return f"others than its owner may read the key: chmod 600 {tls.private_key}"
     return ""
 
 

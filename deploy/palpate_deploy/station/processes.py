@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from palpate.config import LinkConfig, Role
 from palpate.errors import ConfigError, PalpateError
@@ -22,6 +22,9 @@ from palpate_deploy.station import logs
 from palpate_deploy.station.host import new_run_folder, write_profile
 from palpate_deploy.station.lifetime import end_with_parent, start_child, stop_child
 from palpate_deploy.station.profile import Profile, Service
+
+if TYPE_CHECKING:
+    from palpate_deploy.station.certificates import IssuedCertificate
 
 _log = logging.getLogger(__name__)
 
@@ -74,6 +77,45 @@ def role_of(service: Service) -> Role:
     if service == "router":
         return Role.ROUTER
     return Role.GATEWAY if service == "gateway" else Role.SERVICE
+
+
+def check_certificates(profile: Profile, *, private: bool) -> list[IssuedCertificate]:
+    """Check that the certificates of a profile's processes hold; ``private`` as they are read.
+
+    Returns:
+        One for each role; empty = the profile names none.
+
+    Raises:
+        ConfigError: One is missing, not accepted by others, or of another role.
+        MissingExtraError: What reads certificates is not installed.
+    """
+    link = profile.link
+    ours: list[IssuedCertificate] = []
+    if not link.has_tls:
+        return ours
+    check_installed("cryptography", extra="security")
+    from palpate_deploy.station.certificates import read_certificate
+
+    for role in dict.fromkeys(role_of(service) for service in profile.processes):
+        tls = link.as_role(role).tls
+        assert tls is not None
+        one = read_certificate(tls, private=private)
+        if one.problem:
+            raise ConfigError(
+                f"{tls.certificate}: {one.problem}", remedy="issue another: palpate certs issue"
+            )
+        if tls.roles and one.role is not role:
+            raise ConfigError(
+                f"{tls.certificate} is that of a {one.role}, a {role} needs its own",
+                remedy="make a folder for each role: [link] certificates",
+            )
+        if ours and one.authority != ours[0].authority:
+            raise ConfigError(
+                f"{tls.certificate} and {ours[0].folder} are of different authorities",
+                remedy="issue all of them by one: palpate certs issue",
+            )
+        ours.append(one)
+    return ours
 
 
 def _run(service: Service, profile: Profile, link: LinkConfig, stop: threading.Event) -> None:

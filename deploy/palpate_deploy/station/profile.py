@@ -370,14 +370,30 @@ def _connect_to(listen: tuple[str, ...]) -> tuple[str, ...]:
 def _check_router(profile: Profile, where: str) -> None:
     if "router" not in profile.processes:
         return
+    if not profile.router.listen:
+        raise ConfigError(
+            f"{where}: router.listen is empty, so that nobody can reach the router",
+            remedy=f'name an address, e.g. listen = ["{DEFAULT_ROUTER}"], or leave it out',
+        )
     for endpoint in profile.router.listen:
-        host, _ = endpoint_host_port(endpoint)
+        host, port = endpoint_host_port(endpoint)
+        if port == 0:
+            raise ConfigError(
+                f"{where}: router.listen {endpoint!r} has no port that others could know",
+                remedy="name a port, e.g. 7447",
+            )
         exposed = not is_loopback(host)
         if exposed and not (profile.link.has_tls and endpoint.startswith("tls/")):
             raise ConfigError(
                 f"{where}: router.listen {endpoint!r} is reachable from other hosts without "
                 "mutual TLS",
                 remedy="use tls/HOST:PORT and [link] certificates, or listen on 127.0.0.1",
+            )
+        if endpoint.startswith("tls/") and not profile.link.has_tls:
+            raise ConfigError(
+                f"{where}: router.listen {endpoint!r} needs certificates, and there are none",
+                remedy="name their folder: [link] certificates; or listen at "
+                f"tcp/{endpoint.partition('/')[2]}",
             )
     own = {endpoint_host_port(endpoint) for endpoint in profile.router.listen}
     for endpoint in profile.router.connect:

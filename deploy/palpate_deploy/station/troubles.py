@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.bus import Session
+from palpate.bus.link import RouterRefuses
 from palpate.census import ROUTER, SUPERVISOR, ProcessName, ProcessReport
 from palpate.config import LinkConfig, endpoint_host_port, is_loopback
 from palpate.errors import LinkError
@@ -71,7 +72,8 @@ def ask_through_router(link: LinkConfig, station: str, said: Expectation | None)
     try:
         return Session.open(link.model_copy(update={"direct": False}), station=station)
     except LinkError as error:
-        if said is None or ROUTER not in said.processes:
+        refused = isinstance(error, RouterRefuses)
+        if refused or said is None or ROUTER not in said.processes:
             raise
         raise LinkError(
             f"the router at {', '.join(link.connect)} does not answer, but should: {said.source}",

@@ -18,7 +18,7 @@ from rich.text import Text
 from palpate.bus import Delivery, Session, Subscriber
 from palpate.bus.topics import STATUS
 from palpate.census import ROUTER, SUPERVISOR
-from palpate.errors import ConfigError, PalpateError, StreamTimeout
+from palpate.errors import ConfigError, MissingExtraError, PalpateError, StreamTimeout
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import ServiceManager
 from palpate.messages import ServiceState, Status, SupervisedProcess
@@ -26,7 +26,7 @@ from palpate.process import Closing, ProcessUsage, stop_on_signals
 from palpate_deploy.station.host import join
 from palpate_deploy.station.lifetime import end_with_parent
 from palpate_deploy.station.logs import cell, print_error
-from palpate_deploy.station.processes import check_packages, ended_error
+from palpate_deploy.station.processes import check_certificates, check_packages, ended_error
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.status import duration_text, shown_counters, state_text
 from palpate_deploy.station.supervision import (
@@ -48,12 +48,15 @@ def run_up(profile: Profile, name: str) -> int:
     """Run a station until a signal, or until its finite source has ended; the exit code.
 
     Raises:
-        ConfigError: A process cannot serve what the profile says.
+        ConfigError: A process cannot serve what the profile says, or its certificate does not hold.
         LinkError: The router's port is in use.
         MissingExtraError: A process needs a package that is not installed.
         SupervisorError: supervisord does not start, dies or hangs.
     """
     check_packages(profile)
+    with contextlib.suppress(MissingExtraError):  # for this check only: no process needs it
+        # Not who may read the keys: those that systemd hands over seem open to a group.
+        check_certificates(profile, private=False)
     console = Console()
     manager = ServiceManager()
     # A service manager that finds it hanging asks where, before it kills it.

@@ -32,7 +32,7 @@ class SensorReport:
         self._looked_s = 0.0
         self._faults: frozenset[tuple[FaultKind, str]] = frozenset()
         self._zero_lost = False
-        self._refused = False
+        self._refused: DeviceError | None = None
         self._lost_by, self._log_again_s = "", 0.0
         self._taken_by = ""
         self.is_wrong = False
@@ -109,9 +109,11 @@ class SensorReport:
     def tare_refused(self, error: DeviceError | None) -> None:
         """Why the last attempt to tare failed; None = there was none, or it succeeded."""
         if error is None:
-            self._refused = False
-        elif not self._refused:
-            self._refused = True
+            if self._refused is not None:
+                self._health.over(self._refused)
+            self._refused = None
+        elif self._refused is None:
+            self._refused = error
             self._health.fail(error, degraded=False)
             _log.warning("sensor %s: %s", self._name, error, extra=about(self._name))
 

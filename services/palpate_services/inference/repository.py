@@ -159,7 +159,12 @@ class Repository:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(prefix=".import.", dir=self.folder) as temporary:
-                return self._move_in(_copied(source, Path(temporary) / "bundle"), check)
+                copy = _copied(source, Path(temporary) / "bundle")
+                try:
+                    return self._move_in(copy, check)
+                except BundleError as error:  # it names the copy, which is gone when it is read
+                    problem = error.problem.replace(str(copy), str(source))
+                    raise BundleError(problem, remedy=error.remedy) from error
         except OSError as error:
             raise ConfigError(
                 f"{source} cannot be copied into {self.folder}: {error.strerror or error}",

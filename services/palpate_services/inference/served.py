@@ -110,8 +110,8 @@ class ServedModels:
         file: Remembers what is served beyond the end of this process; None = nothing does.
 
     Raises:
-        ConfigError: A bundle that the profile names does not exist.
-        BundleError: It breaks its contract.
+        ConfigError: A bundle that the profile names does not exist, breaks its contract, or is for
+            another task.
         MissingExtraError: ONNX Runtime is not installed.
     """
 
@@ -138,7 +138,7 @@ class ServedModels:
             return
         if remembered is None:
             for sensor, bundle in wanted.items():
-                assigned[sensor] = Assignment(self._open(bundle), time.time_ns())
+                assigned[sensor] = Assignment(self._first(bundle), time.time_ns())
         else:
             for sensor, one in remembered.items():
                 assigned[sensor] = self._restored(sensor, one, wanted.get(sensor))
@@ -147,6 +147,15 @@ class ServedModels:
             self._remember()
         except ConfigError as error:  # a full disk is no reason not to serve
             _log.warning("%s", error)
+
+    def _first(self, bundle: str) -> Choice:
+        try:
+            return self._open(bundle)
+        except BundleError as error:  # it stays so: to start again is of no use
+            raise ConfigError(
+                f"the {self._task} service cannot serve {bundle!r}: {error.problem}",
+                remedy=error.remedy,
+            ) from error
 
     @property
     def problem(self) -> PalpateError | None:

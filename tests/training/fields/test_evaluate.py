@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -135,7 +136,7 @@ def test_one_press_has_no_interval(of_features: Path, tmp_path: Path) -> None:
     data = open_dataset(of_features / "features.h5")
     assert data.in_contact is not None
     own = np.flatnonzero(data.group == data.group[data.in_contact][0])
-    columns = {name: values[own] for name, values in data.arrays().items()}
+    columns: dict[str, Any] = {name: values[own] for name, values in data.arrays().items()}
     write_dataset(tmp_path / "one.h5", replace(data, **columns))
     found = evaluate(of_features / "bundle", [tmp_path / "one.h5"])
     first = found.figures[0]

@@ -22,7 +22,10 @@ from palpate_training.datasets.features import open_dataset
 
 Mixed = Annotated[Path, typer.Argument(help="Mixed data set (.h5).")]
 Bundle = Annotated[Path, typer.Argument(help="Folder of the bundle; must not exist.")]
-Version = Annotated[int, typer.Option(min=1, help="Version of the bundle.")]
+Version = Annotated[
+    int | None,
+    typer.Option(min=1, help="Version of the bundle; none = the folder's name, if a number, or 1."),
+]
 Epochs = Annotated[int, typer.Option(min=1, help="Passes over the rows at most, each network.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of split and weights.")]
 
@@ -71,7 +74,7 @@ def train_field(
         str, typer.Option(help="Specimens to train on, with commas between; empty = all.")
     ] = "",
     name: Annotated[str, typer.Option(help="Name of the bundle.")] = "field",
-    version: Version = 1,
+    version: Version = None,
     seed: Seed = 0,
     epochs: Epochs = EPOCHS,
     gain_spread: GainSpread = GAIN_SPREAD,
@@ -85,6 +88,7 @@ def train_field(
     """
     from palpate_training.tasks.fields import field_bundle
 
+    version = _version(version, out)
     chosen = tuple(unit.strip() for unit in units.split(",") if unit.strip())
     metrics = _bundle(
         field_bundle,
@@ -109,7 +113,7 @@ def train_synthesis(
     out: Bundle,
     unit: Annotated[str, typer.Option(help="The specimen whose electrodes are synthesised.")],
     name: Annotated[str, typer.Option(help="Name of the bundle.")] = "synthesis",
-    version: Version = 1,
+    version: Version = None,
     seed: Seed = 0,
     epochs: Epochs = EPOCHS,
     device: Device = "auto",
@@ -121,6 +125,7 @@ def train_synthesis(
     """
     from palpate_training.tasks.synthesis import synthesis_bundle
 
+    version = _version(version, out)
     metrics = _bundle(
         synthesis_bundle, "synthesis", data, out, epochs, batch_rows,
         device=device, unit=unit, name=name, version=version, seed=seed,
@@ -138,7 +143,7 @@ def train_all(
         str, typer.Option(help="Specimen whose electrodes are synthesised; empty = the first.")
     ] = "",
     name: Annotated[str, typer.Option(help="Bundles are called features-NAME, ...")] = "twin",
-    version: Version = 1,
+    version: Annotated[int, typer.Option(min=1, help="Version of the bundles.")] = 1,
     seed: Seed = 0,
     epochs: Epochs = EPOCHS,
     gain_spread: GainSpread = GAIN_SPREAD,
@@ -330,7 +335,7 @@ def train_features_command(
     data: Annotated[Path, typer.Option(help="Data set (.h5).")],
     out: Annotated[Path, typer.Option(help="Folder of the bundle; must not exist.")],
     name: Annotated[str, typer.Option(help="Name of the bundle.")] = "features",
-    version: Version = 1,
+    version: Version = None,
     seed: Seed = 0,
     epochs: Epochs = EPOCHS,
     gain_spread: GainSpread = GAIN_SPREAD,
@@ -346,6 +351,7 @@ def train_features_command(
     """
     from palpate_training.tasks.features import FEATURES_CONFIG, train_features
 
+    version = _version(version, out)
     with _progress() as progress:
         tasks = {}
 
@@ -509,6 +515,13 @@ def train_intervals(
 
     digest = add_intervals(bundle, held_out, out, others=other or ())
     console.print(f"wrote {out}, digest {digest.hex()}")
+
+
+def _version(given: int | None, out: Path) -> int:
+    """Of a bundle in a folder: a repository takes the folder's name for it."""
+    if given is not None:
+        return given
+    return int(out.name) if out.name.isdecimal() and int(out.name) > 0 else 1
 
 
 def _bundle(

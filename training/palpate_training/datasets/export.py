@@ -207,7 +207,8 @@ def features(
         Rows of one unique trajectory have one group, and are held out together over all units.
 
     Raises:
-        DatasetError: The rest of a trial is not known, and none is to be assumed.
+        DatasetError: The rest of a trial is not known, and none is to be assumed, or one with which
+            electrodes leave their range.
     """
     contact = data.contact if isinstance(data, MixedDataset) else None
     data = data.experiment if isinstance(data, MixedDataset) else data
@@ -219,6 +220,17 @@ def features(
                 f"rest of {data.trial_name(int(np.flatnonzero(unknown)[0]))} is not known"
                 f" ({unknown.sum()} of {data.trials} trials)",
                 remedy="state the rest to assume: --assumed-rest 3300",
+            )
+        change = data.tared[np.isin(data.trial, np.flatnonzero(unknown))] * COUNTS_MAX
+        low, high = np.ceil(-change.min()), np.floor(COUNTS_MAX - change.max())
+        if not low <= assumed_rest <= high:
+            raise DatasetError(
+                f"with a rest of {assumed_rest} counts electrodes read from"
+                f" {assumed_rest + change.min():.0f} to {assumed_rest + change.max():.0f}, not from"
+                f" 0 to {COUNTS_MAX}",
+                remedy=f"assume a rest from {low:.0f} to {high:.0f}"
+                if low <= high
+                else "see whether they are shares of the full scale",
             )
         rest[unknown] = assumed_rest
     # Where each row of the result comes from: a row of the data, or the rest of a trial (-1).

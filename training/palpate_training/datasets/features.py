@@ -269,6 +269,30 @@ def _check_values(data: FeatureDataset) -> None:
         )
 
 
+FORCE_MOST_N = 1e4
+"""No fingertip bears more: such a reading is none [N]."""
+
+
+def check_learnable(data: FeatureDataset) -> None:
+    """Refuse rows that nothing can be learned from, before time is spent on it.
+
+    Raises:
+        DatasetError: A force is beyond ``FORCE_MOST_N``, or force or electrodes never change.
+    """
+    row, axis = np.unravel_index(np.argmax(np.abs(data.force)), data.force.shape)
+    if abs(data.force[row, axis]) > FORCE_MOST_N:
+        raise DatasetError(
+            f"{data.name}: force {'xyz'[axis]} is {data.force[row, axis]:.3g} N in row {row}",
+            remedy="give newtons, and drop rows that the force sensor did not measure",
+        )
+    for name, values in (("force", data.force), ("electrodes, tared,", data.tared_counts)):
+        if not np.ptp(values, axis=0).any():
+            raise DatasetError(
+                f"{data.name}: {name} is the same in all {len(data)} rows",
+                remedy="record presses of different strength, with both sensors connected",
+            )
+
+
 FEATURES_SCHEMA = Hdf5Schema("palpate.features", 1, "use a file made by `palpate data ingest-...`")
 
 _CHUNK_ROWS = 4096

@@ -107,7 +107,14 @@ def rows_of_streams(
         raise DatasetError(
             f"{path}: no electrode frames", remedy="record the stream electrodes of a sensor"
         )
-    if any("contact_location" not in part for part in parts):
+    notes = "wrench and pose at the middle of each frame; group = press"
+    without = [
+        name for name, part in zip(names, parts, strict=True) if "contact_location" not in part
+    ]
+    if without:
+        if len(without) < len(parts):
+            notes += f"; no contact locations, because {', '.join(without)} has no pose"
+            _log.warning("%s: contact locations are left out: %s has no pose", path, without)
         for part in parts:
             part.pop("contact_location", None)
     columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
@@ -121,7 +128,7 @@ def rows_of_streams(
             input_sha256=sha256_of(path),
             licence=licence,
             palpate_version=__version__,
-            notes="wrench and pose at the middle of each frame; group = press",
+            notes=notes,
         ),
         name=str(path),
     )
@@ -311,8 +318,12 @@ def ingest_lasa(
 
     Raises:
         DatasetError: The archive is missing, damaged, or not this one; it lacks a finger; a
-            finger's arrays do not fit together.
+            finger's arrays do not fit together, or it is named twice.
     """
+    if len(set(fingers)) < len(fingers):
+        raise DatasetError(
+            f"a finger is named twice: {', '.join(map(str, fingers))}", remedy="name each once"
+        )
     remedy = "give the archive force_calibration.npz of the LASA force calibration"
     chosen: list[int] = []
 

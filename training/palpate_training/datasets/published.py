@@ -27,7 +27,7 @@ from palpate.errors import DatasetError
 from palpate.files.hdf5 import name_a_file, opened, text
 from palpate.process import require
 from palpate_training.datasets.assembly import assemble_experiment
-from palpate_training.datasets.container import Provenance
+from palpate_training.datasets.container import Provenance, read_provenance
 from palpate_training.datasets.experiment import ExperimentDataset
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.datasets.processing import THRESHOLD_N
@@ -106,11 +106,15 @@ def read_published(
         for unit, file, of_file, ids in zip(wanted, files, runs, names, strict=True)
         for run, name in zip(of_file, ids, strict=True)
     ]
+    # An export of palpate's own says where it comes from; the publisher's files do not.
+    sources = dict.fromkeys(f.provenance.source for f in files if f.provenance.source)
+    licences = dict.fromkeys(f.provenance.licence for f in files if f.provenance.licence)
+    published = "published experiment of Narang et al.: " + ", ".join(f.path.name for f in files)
     provenance = Provenance(
-        source="published experiment of Narang et al.: " + ", ".join(f.path.name for f in files),
+        source="; ".join(sources) or published,
         command=command,
         input_sha256=hashlib.sha256("".join(f.sha256 for f in files).encode()).hexdigest(),
-        licence="the publisher's; see where it was downloaded",
+        licence="; ".join(licences) or "the publisher's; see where it was downloaded",
         palpate_version=__version__,
         notes=f"axes {','.join(axes)}; location was in {files[0].location_unit}; trajectories found"
         " by indenter, fall of the force to 0.5 N and jumps of the tip, and matched over units by"
@@ -147,6 +151,7 @@ class _PublishedFile:
                 name: file[_group(path, file, name)]["data"][()] for name in GROUPS
             }
             names = file[_group(path, file, "indenter")]["data"].attrs.get("names")
+            self.provenance = read_provenance(file.attrs)
         rows = len(arrays["electrodes"])
         for name, columns in (("electrodes", ELECTRODES), ("location", 3), ("force", 3)):
             _check_table(path, name, arrays[name], (rows, columns))

@@ -40,6 +40,9 @@ Values = npt.NDArray[np.float64]
 BLOCKS = 20
 """Contiguous pieces that a sensor's rows are cut into where nothing says what one press is."""
 
+PROVENANCE_COLUMNS = ("source", "licence")
+"""Columns of a CSV file of ours that say the same in every row."""
+
 MISSING = np.iinfo(np.int64).min
 """Stands for a time, a label or a truth that a row lacks."""
 
@@ -183,6 +186,10 @@ def export_table(path: Path, data: FeatureDataset, *, csv: bool = False) -> None
     import pyarrow.parquet
 
     table = table_of(data)
+    if csv:  # which has no metadata, so every row says where it comes from
+        for name in PROVENANCE_COLUMNS:
+            words = [getattr(data.provenance, name)] * len(data)
+            table = table.append_column(name, [words])
 
     def write(part: Path) -> None:
         if csv:
@@ -275,10 +282,10 @@ def dataset_of(
         **{name: arrays[name].astype(FEATURE_COLUMNS[name].dtype) for name in arrays},
         sensor_names=names,
         provenance=Provenance(
-            source=known.get("source", f"{source.name}, {rows} rows"),
+            source=known.get("source") or f"{source.name}, {rows} rows",
             command=command,
             input_sha256=sha256_of(source) if source.is_file() else "",
-            licence=licence or known.get("licence", "not stated"),
+            licence=licence or known.get("licence") or "not stated",
             palpate_version=__version__,
             notes="; ".join(_notes(columns, table.column_names, left_out)),
         ),
@@ -292,7 +299,11 @@ def _provenance(table: pa.Table) -> dict[str, str]:
         facts = json.loads((table.schema.metadata or {})[METADATA])["provenance"]
         return {name: str(facts[name]) for name in ("source", "licence")}
     except (KeyError, TypeError, ValueError):
+        pass
+    if not {*columns_of("electrodes"), *PROVENANCE_COLUMNS} <= set(table.column_names):
         return {}
+    said = {name: table.column(name).unique().to_pylist() for name in PROVENANCE_COLUMNS}
+    return {name: "; ".join(map(str, filter(None, words))) for name, words in said.items()}
 
 
 def _notes(columns: ColumnMap, names: Sequence[str], left_out: int) -> Iterator[str]:

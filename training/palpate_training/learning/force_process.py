@@ -213,10 +213,14 @@ def _changes(tared: Tensor, rest: Tensor, common: float) -> Tensor:
     return change - (1.0 - common) * change.mean(dim=1, keepdim=True)
 
 
+_CONSTANT = 1e-9
+"""A smaller spread, of counts or logarithms, is rounding."""
+
+
 def _spread(inputs: Floats) -> Floats:
     """Of each input; one that never changes counts with one."""
     spread = inputs.std(axis=0)
-    return np.where(spread > 0.0, spread, 1.0)
+    return np.where(spread > _CONSTANT, spread, 1.0)
 
 
 def unit(vectors: Tensor) -> Tensor:

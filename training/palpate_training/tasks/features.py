@@ -26,6 +26,7 @@ from palpate_training.datasets.features import (
     BoolArray,
     FeatureDataset,
     IndexArray,
+    check_learnable,
     open_dataset,
     press_of,
 )
@@ -104,12 +105,13 @@ def train_features(
 
     Raises:
         ConfigError: There is no GPU, but one is wanted.
-        DatasetError: The data set breaks its schema or has too few presses.
+        DatasetError: The data set breaks its schema, has too few presses, or never changes.
         BundleError: The folder exists, or parity fails; nothing is left on disk.
     """
     refuse_existing(bundle_dir, name)
     where = training_device(device)
     data = open_dataset(dataset_path)
+    check_learnable(data)
     press = press_of(data)
     split = by_group(press, seed=seed)
     x = data.tared_counts

@@ -24,7 +24,7 @@ from torch import nn
 from palpate.errors import DatasetError
 from palpate.files.intervals import BoundFormula, Intervals
 from palpate.messages import TrainingRange
-from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.features import FeatureDataset, check_learnable
 from palpate_training.learning.export import export_features, refuse_existing
 from palpate_training.learning.force_process import (
     LOCALITIES,
@@ -233,8 +233,7 @@ class HeldOutPresses:
         metrics = force_metrics(estimate[touched], truth)
         errors = force_errors(estimate[touched], truth)
         metrics["force_magnitude_p95_n"] = float(np.percentile(errors["magnitude_n"], 95.0))
-        within = np.abs(estimate - known.force)[touched] <= _DEVIATIONS * force_sd
-        metrics["coverage_90"] = float(within.mean())
+        metrics["coverage_90"] = _coverage(estimate - known.force, known.press, touched)
         for name, other in rivals.items():
             found = force_metrics(other[touched], truth)
             for key in ("force_magnitude_median_n", "force_angle_median_rad"):
@@ -362,8 +361,9 @@ def known_rows(data: FeatureDataset) -> tuple[KnownRows, npt.NDArray[np.bool_]]:
     """Rows to fit to, evenly over the presses, and which of them are touched.
 
     Raises:
-        DatasetError: The data holds several fingers, or too few presses.
+        DatasetError: The data holds several fingers, too few presses, or never changes.
     """
+    check_learnable(data)
     if len(data.sensor_names) > 1:
         raise DatasetError(
             f"{data.name} holds {len(data.sensor_names)} fingers: {', '.join(data.sensor_names)}",
@@ -474,6 +474,15 @@ def full_estimate_of(net: nn.Module, tared: Floats) -> Floats:
     """All that an estimator gives, force first, of tared counts (N, 19)."""
     with torch.inference_mode():
         return np.asarray(net(torch.from_numpy(tared)).numpy())
+
+
+def _coverage(errors: Floats, press: Rows, touched: npt.NDArray[np.bool_]) -> float:
+    """Share of the errors of touched rows within intervals that other presses' errors gave."""
+    within = np.zeros(errors.shape, np.bool_)
+    for out in _folds(press, FOLDS):
+        force_sd = _force_sd(errors[~out], press[~out])
+        within[out] = np.abs(errors[out]) <= _DEVIATIONS * force_sd
+    return float(within[touched].mean())
 
 
 def _force_sd(errors: Floats, press: Rows) -> Floats:
