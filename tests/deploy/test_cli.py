@@ -19,6 +19,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from palpate.bus import Session
 from palpate.errors import (
     BundleError,
     ConfigError,
@@ -284,7 +285,7 @@ def test_a_tare_over_many_frames_is_waited_for(monkeypatch: pytest.MonkeyPatch) 
         given[frames] = timeout_s
         raise StreamTimeout("silent", remedy="ask again")
 
-    monkeypatch.setattr(tare.Session, "open", lambda *_, **__: Joined())
+    monkeypatch.setattr(Session, "open", lambda *_, **__: Joined())
     monkeypatch.setattr(tare, "ask_tare", ask)
     for frames in ("0", "800"):
         CliRunner().invoke(app, ["tare", "--frames", frames])
