@@ -9,7 +9,8 @@ import re
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -383,7 +384,7 @@ def parse_config(model: type[C], values: Mapping[str, Any], *, where: str) -> C:
 def config_error(model: type[BaseModel], error: ValidationError, *, where: str) -> ConfigError:
     """Translate pydantic's first complaint into one line that names file, key and remedy."""
     first = error.errors()[0]
-    path = ".".join(str(part) for part in first["loc"])
+    path = ".".join(str(part) for part in _keys(model, first["loc"]))
     if first["type"] == "extra_forbidden":
         known = _known_keys(model, first["loc"])
         near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1, cutoff=0.5)
@@ -397,6 +398,22 @@ def config_error(model: type[BaseModel], error: ValidationError, *, where: str) 
         f"{where}: {path or 'configuration'} = {first['input']!r}: {message}{more}",
         remedy=f"correct {path or 'it'} in {where}",
     )
+
+
+def _keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[int | str]:
+    """The keys of a place in a configuration: pydantic adds the member of a union that it tried."""
+    current: type[BaseModel] | None = model
+    keys: list[int | str] = []
+    for part in loc:
+        keys.append(part)
+        field = None if current is None else current.model_fields.get(str(part))
+        if field is not None:
+            current = _nested_model(field.annotation)
+            members = {*get_args(field.annotation)} - {type(None)}
+            united = get_origin(field.annotation) in (Union, UnionType)
+            if united and current is None and len(members) > 1:
+                break
+    return keys
 
 
 def _known_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:

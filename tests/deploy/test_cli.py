@@ -19,6 +19,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from palpate.bus import Session
 from palpate.errors import (
     BundleError,
     ConfigError,
@@ -27,10 +28,12 @@ from palpate.errors import (
     MissingExtraError,
     PalpateError,
     RecordingError,
+    StreamTimeout,
 )
 from palpate_deploy.cli import data as training
 from palpate_deploy.cli.app import app
 from palpate_deploy.diagnose import doctor
+from palpate_deploy.station import tare
 from palpate_deploy.station.host import check_free, free_endpoint
 from palpate_deploy.station.logs import exit_code
 from palpate_deploy.station.profile import changed, load_profile
@@ -263,6 +266,41 @@ def test_doctor_warns_of_sensors_that_no_gateway_has() -> None:
     assert fix
     alone = strange.model_copy(update={"processes": ("router", "gateway")})
     assert doctor._sensors(alone)[0] == "ok"
+
+
+def test_a_tare_over_many_frames_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[int, float] = {}
+
+    class Joined:
+        def __enter__(self) -> Joined:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def serves(self, *_: object, **__: object) -> bool:
+            return False
+
+    def ask(_: object, sensor: str, *, frames: int, timeout_s: float) -> None:
+        given[frames] = timeout_s
+        raise StreamTimeout("silent", remedy="ask again")
+
+    monkeypatch.setattr(Session, "open", lambda *_, **__: Joined())
+    monkeypatch.setattr(tare, "ask_tare", ask)
+    for frames in ("0", "800"):
+        CliRunner().invoke(app, ["tare", "--frames", frames])
+    assert given == {0: 5.0, 800: 25.0}  # 800 frames at 100 Hz take 8 s
+    CliRunner().invoke(app, ["tare", "--frames", "800", "--timeout-s", "3"])
+    assert given[800] == 3.0
+    refused = CliRunner().invoke(app, ["tare", "--frames", "-3"])
+    assert refused.exit_code == 2
+    assert "--frames" in refused.output
+
+
+def test_a_roll_back_has_no_dry_run() -> None:
+    refused = CliRunner().invoke(app, ["install", "virtual", "--dry-run", "--rollback"])
+    assert refused.exit_code == 2
+    assert "--dry-run" in refused.output
 
 
 def test_doctor_looks_for_all_that_simulations_need() -> None:

@@ -7,12 +7,19 @@ from pathlib import Path
 
 import pytest
 
+from palpate.census import SUPERVISOR
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, LinkError
-from palpate_deploy.station.host import free_endpoint, new_run_folder, write_profile
+from palpate_deploy.station.host import (
+    free_endpoint,
+    new_run_folder,
+    write_profile,
+    write_run_file,
+)
 from palpate_deploy.station.profile import parse_profile
 from palpate_deploy.station.troubles import (
     ask_through_router,
+    expectation,
     expectation_here,
     expectation_of,
 )
@@ -84,3 +91,21 @@ def test_a_router_that_should_answer_is_not_said_to_be_absent() -> None:
     with pytest.raises(LinkError, match="does not answer, but should") as hangs:
         ask_through_router(link, "lab", expectation_here([here], "lab"))
     assert "by itself" in hangs.value.remedy
+
+
+def test_a_supervisor_that_hangs_is_missed_beside_a_named_profile() -> None:
+    here = free_endpoint()
+    link = LinkConfig(connect=(here,))
+    said = expectation(link, "lab", "virtual")
+    assert said is not None
+    assert SUPERVISOR not in said.processes
+    a_run(here)
+    said = expectation(link, "lab", "virtual")
+    assert said is not None
+    assert said.source == "profile virtual"
+    assert said.processes == expectation_of("virtual").processes | {SUPERVISOR}
+
+
+def test_a_full_disk_of_state_is_told_with_a_remedy() -> None:
+    with pytest.raises(ConfigError, match=r"No space left.*XDG_STATE_HOME"):
+        write_run_file(Path("/dev/full"), "a profile")

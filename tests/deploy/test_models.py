@@ -19,6 +19,7 @@ from palpate.bus import Session
 from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate.files.bundle import read_bundle, write_bundle
+from palpate_deploy.station import models
 from palpate_services.inference.repository import resolve
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -152,3 +153,13 @@ def test_a_printed_profile_names_no_folder_of_who_printed_it(palpate: Palpate) -
     assert "share/palpate" not in printed.stdout
     assert "XDG" not in printed.stdout
     assert os.environ["XDG_STATE_HOME"] not in printed.stdout
+
+
+def test_no_service_is_named_that_the_station_may_not_have() -> None:
+    class Silent:
+        def served(self, service: str) -> Any:
+            raise LinkError(f"no service {service!r} answers", remedy="start it")
+
+    admin: Any = Silent()
+    with pytest.raises(LinkError, match="none of the services features, field answers"):
+        models._served(admin, ("features", "field"))

@@ -66,6 +66,12 @@ def test_unknown_process_is_named(tmp_path: Path) -> None:
         load_profile(path)
 
 
+def test_a_value_of_several_types_is_named_by_its_key(tmp_path: Path) -> None:
+    path = _write(tmp_path, "[gateway]\ncore = -5")
+    with pytest.raises(ConfigError, match=r"gateway\.core = -5"):
+        load_profile(path)
+
+
 def test_bad_toml_names_the_line(tmp_path: Path) -> None:
     path = _write(tmp_path, 'station = "lab"\n[features\n')
     with pytest.raises(ConfigError, match=r"mine\.toml is not TOML.*line 2"):
@@ -75,6 +81,12 @@ def test_bad_toml_names_the_line(tmp_path: Path) -> None:
 def test_missing_file() -> None:
     with pytest.raises(ConfigError, match="does not exist"):
         load_profile("./nowhere.toml")
+
+
+def test_a_folder_is_no_profile(tmp_path: Path) -> None:
+    (tmp_path / "d.toml").mkdir()
+    with pytest.raises(ConfigError, match="is no file"):
+        load_profile(tmp_path / "d.toml")
 
 
 def test_unknown_name_gives_the_nearest() -> None:

@@ -174,9 +174,14 @@ def tare(
     sensor: Annotated[str, typer.Argument(help="Name of the sensor.")] = "finger",
     frames: Annotated[
         int,
-        typer.Option(help="Frames (force/torque: readings) to average; 0 = the gateway's setting."),
+        typer.Option(
+            min=0, help="Frames (force/torque: readings) to average; 0 = the gateway's setting."
+        ),
     ] = 0,
-    timeout_s: Annotated[float, typer.Option(min=0, help="Longest time to wait [s].")] = 5.0,
+    timeout_s: Annotated[
+        float | None,
+        typer.Option(min=0, help="Longest time to wait [s]; default: enough for the frames."),
+    ] = None,
     connect: ConnectOption = DEFAULT_CONNECT,
     tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,

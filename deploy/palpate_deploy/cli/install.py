@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from palpate.errors import ConfigError
 from palpate_deploy.cli.options import example
 
 RootOption = Annotated[
@@ -71,6 +72,11 @@ def install(
     """
     from palpate_deploy.install.plan import InstallOrder
 
+    if dry_run and rollback:
+        raise ConfigError(
+            "--dry-run shows what an install would write, not a roll-back",
+            remedy="leave out one of them; a second --rollback undoes the first",
+        )
     if kubernetes is not None:
         from palpate_deploy.install.kubernetes import write_manifests
 

@@ -139,7 +139,25 @@ def _in_use(folder: Path) -> bool:
 
 
 def write_profile(profile: Profile, folder: Path) -> Path:
-    """Write the resolved profile that all processes of a run read."""
-    path = folder / "profile.toml"
-    path.write_text(tomli_w.dumps(plain_values(profile)), encoding="utf-8")
+    """Write the resolved profile that all processes of a run read.
+
+    Raises:
+        ConfigError: The disk refuses.
+    """
+    return write_run_file(folder / "profile.toml", tomli_w.dumps(plain_values(profile)))
+
+
+def write_run_file(path: Path, text: str) -> Path:
+    """Write a file into the folder of a run; the path again.
+
+    Raises:
+        ConfigError: The disk refuses.
+    """
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"{path} cannot be written: {error.strerror or error}",
+            remedy="free some space there, or set XDG_STATE_HOME to a folder of another disk",
+        ) from error
     return path

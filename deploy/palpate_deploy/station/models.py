@@ -204,7 +204,10 @@ def _served(admin: ModelAdmin, services: tuple[str, ...]) -> dict[str, tuple[Mod
         except LinkError as error:
             silent = error
     if not found and silent is not None:
-        raise silent
+        if len(services) == 1:
+            raise silent
+        # Which of them the station should have is not known here.
+        raise LinkError(f"none of the services {', '.join(services)} answers", remedy=silent.remedy)
     return found
 
 

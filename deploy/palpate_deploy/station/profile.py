@@ -237,7 +237,7 @@ def profile_path(profile: str | Path) -> Path:
         if path.is_file():
             return path
         raise ConfigError(
-            f"profile {path} does not exist",
+            f"profile {path} {'is no file' if path.exists() else 'does not exist'}",
             remedy=f"check the path, or use one by name: {', '.join(profile_names())}",
         )
     path = PROFILES / f"{text}.toml"

@@ -25,8 +25,7 @@ from palpate_deploy.station.logs import FAILED, cell
 from palpate_deploy.station.troubles import (
     Trouble,
     ask_through_router,
-    expectation_here,
-    expectation_of,
+    expectation,
     process_name,
     troubles,
 )
@@ -158,9 +157,7 @@ def show_status(
         LinkError: There is no router.
         ConfigError: There is no such profile.
     """
-    said = expectation_here(link.connect, station)
-    if profile is not None:
-        said = expectation_of(profile)
+    said = expectation(link, station, profile)
     with ask_through_router(link, station, said) as session:
         expected = frozenset() if said is None else said.processes
         census = take_census(session, expected=expected, timeout_s=timeout_s)

@@ -24,7 +24,7 @@ from supervisor.states import getProcessStateDescription
 
 from palpate.errors import PalpateError
 from palpate.heartbeat import FILE_VARIABLE, read_pulse
-from palpate_deploy.station.host import check_free, new_run_folder, write_profile
+from palpate_deploy.station.host import check_free, new_run_folder, write_profile, write_run_file
 from palpate_deploy.station.lifetime import start_child, stop_child
 from palpate_deploy.station.logs import DEVICE
 from palpate_deploy.station.processes import START_ORDER, command_line
@@ -80,6 +80,7 @@ class Supervisor:
     """The processes of a profile, kept running until ``stop``; the run's folder bears the name.
 
     Raises:
+        ConfigError: The run's folder or a file in it cannot be written.
         LinkError: The router's port is in use.
         SupervisorError: supervisord does not start.
     """
@@ -95,8 +96,8 @@ class Supervisor:
         in_memory = _MEMORY if os.access(_MEMORY, os.W_OK) else None
         self._socket_folder = Path(tempfile.mkdtemp(prefix="palpate-", dir=in_memory))
         self._socket = self._socket_folder / "supervisor.sock"
-        config = self.folder / "supervisord.conf"
-        config.write_text(self._config_text(write_profile(profile, self.folder)), encoding="utf-8")
+        text = self._config_text(write_profile(profile, self.folder))
+        config = write_run_file(self.folder / "supervisord.conf", text)
         command = [sys.executable, "-m", "palpate_deploy.station.supervisord"]
         command += ["-n", "-s", "-c", str(config)]
         self._process = start_child(

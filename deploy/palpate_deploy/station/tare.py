@@ -18,28 +18,39 @@ LET_GO_S = 60.0
 
 _ASK_S = 10.0
 
+_ANSWER_S = 5.0
+_FRAMES_MOST_S = 10.0
+"""Gateways refuse a request about the frames of more time [s]."""
+_SLOWEST_HZ = 10.0
+
 
 def take_tare(
-    link: LinkConfig, station: str, sensor: str, *, frames: int, timeout_s: float
+    link: LinkConfig, station: str, sensor: str, *, frames: int, timeout_s: float | None
 ) -> None:
     """Tare a BioTac or zero a force/torque sensor, and print the result.
+
+    Without a ``timeout_s`` there is time enough for so many frames of a slow sensor.
 
     Raises:
         LinkError: There is no router, or no gateway serves that sensor.
         RemoteError: The gateway refuses.
         StreamTimeout: It does not answer in time.
     """
+    if timeout_s is None:
+        # Twice, for a zero: it is looked at afterwards, over as many readings.
+        timeout_s = _ANSWER_S + 2.0 * min(frames / _SLOWEST_HZ, _FRAMES_MOST_S)
+    wait_s = timeout_s
     with Session.open(link, station=station) as session:
 
         def zero() -> None:
-            _print_zero(sensor, ask_zero(session, sensor, readings=frames, timeout_s=timeout_s))
+            _print_zero(sensor, ask_zero(session, sensor, readings=frames, timeout_s=wait_s))
 
         # A force/torque sensor has a zero instead of a tare.
         if session.serves(endpoints.ZERO, sensor=sensor):
             zero()
             return
         try:
-            tare = ask_tare(session, sensor, frames=frames, timeout_s=timeout_s)
+            tare = ask_tare(session, sensor, frames=frames, timeout_s=wait_s)
         except LinkError as not_found:
             try:
                 zero()

@@ -35,8 +35,7 @@ from palpate_deploy.station.status import duration_text, nothing_runs
 from palpate_deploy.station.troubles import (
     Trouble,
     ask_through_router,
-    expectation_here,
-    expectation_of,
+    expectation,
     process_name,
     troubles,
 )
@@ -77,7 +76,7 @@ def run_top(
         LinkError: There is no router.
         ConfigError: There is no such profile.
     """
-    said = expectation_of(profile) if profile else expectation_here(link.connect, station)
+    said = expectation(link, station, profile or None)
     expected = frozenset() if said is None else said.processes
     console = Console()
     with (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,24 @@ def expectation_here(connect: Iterable[str], station: str) -> Expectation | None
         }
         return Expectation(f"run {folder.name} on this host", frozenset(names))
     return None
+
+
+def expectation(link: LinkConfig, station: str, profile: str | None) -> Expectation | None:
+    """What should run: what ``profile`` says if one is named, else a run on this host.
+
+    A profile does not say who starts it: its supervisor is expected where a run here has one.
+
+    Raises:
+        ConfigError: There is no such profile, or it is wrong.
+    """
+    here = expectation_here(link.connect, station)
+    if profile is None:
+        return here
+    said = expectation_of(profile)
+    if here is None:
+        return said
+    supervisors = {name for name in here.processes if name[0] == SUPERVISOR[0]}
+    return replace(said, processes=said.processes | supervisors)
 
 
 def ask_through_router(link: LinkConfig, station: str, said: Expectation | None) -> Session:
