@@ -125,7 +125,7 @@ def test_selectors_and_names_meet(written: dict[str, list[dict[str, Any]]]) -> N
     [
         ('"fem", "metrics"', '"gateway"', "gateway cannot run in a cluster"),
         ('["router", "fem", "metrics"]', '["fem"]', "router of its own"),
-        ('certificates = "/etc/palpate/certs"', "", "mutual TLS"),
+        ('certificates = "/etc/palpate/certs"', "", "needs certificates"),
         ('listen = ["tls/127.0.0.1:7447", "tls/0.0.0.0:7447"]', 'listen = ["tls/127.0.0.1:7447"]',
          "loopback only"),
     ],

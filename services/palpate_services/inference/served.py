@@ -110,8 +110,8 @@ class ServedModels:
         file: Remembers what is served beyond the end of this process; None = nothing does.
 
     Raises:
-        ConfigError: A bundle that the profile names does not exist, breaks its contract, or is for
-            another task.
+        ConfigError: A bundle that the profile names does not exist, or is for another task.
+        BundleError: It breaks its contract.
         MissingExtraError: ONNX Runtime is not installed.
     """
 
@@ -149,13 +149,14 @@ class ServedModels:
             _log.warning("%s", error)
 
     def _first(self, bundle: str) -> Choice:
-        try:
-            return self._open(bundle)
-        except BundleError as error:  # it stays so: to start again is of no use
+        """Load a bundle that the profile names; one of another task is a mistake of the profile."""
+        task = self._repository.read(self._repository.resolve(bundle)).manifest.task
+        if task != self._task:
             raise ConfigError(
-                f"the {self._task} service cannot serve {bundle!r}: {error.problem}",
-                remedy=error.remedy,
-            ) from error
+                f"bundle {bundle!r} is for the task {task!r}, not {self._task!r}",
+                remedy=f"name one of the task {self._task!r}: palpate model list",
+            )
+        return self._open(bundle)
 
     @property
     def problem(self) -> PalpateError | None:
