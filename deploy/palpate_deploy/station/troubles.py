@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.bus import Session
-from palpate.bus.link import RouterRefuses
+from palpate.bus.no_router import RouterRefuses
 from palpate.census import ROUTER, SUPERVISOR, ProcessName, ProcessReport
 from palpate.config import LinkConfig, endpoint_host_port, is_loopback
 from palpate.errors import LinkError

@@ -8,8 +8,6 @@ import json
 import logging
 import re
 import secrets
-import socket
-import ssl
 import threading
 import time
 import weakref
@@ -26,6 +24,7 @@ from palpate.bus.claims import ClaimWatch, SensorClaims
 from palpate.bus.delivery import Delivery
 from palpate.bus.endpoints import STATUS, Endpoint
 from palpate.bus.foreign import ForeignPublisher, ForeignSubscriber, ForeignToken
+from palpate.bus.no_router import no_router
 from palpate.bus.presence import AliveService, CallerToken, CallerWatch, Presence, alive
 from palpate.bus.pubsub import Publisher, ReceivedMessage, Subscriber
 from palpate.bus.query import (
@@ -51,7 +50,7 @@ from palpate.bus.topics import (
     sensor_key,
     service_key,
 )
-from palpate.config import LinkConfig, TlsConfig, check_name, endpoint_host_port
+from palpate.config import LinkConfig, check_name
 from palpate.errors import ConfigError, LinkError, PalpateError, WireError
 from palpate.process import Closing
 
@@ -165,70 +164,6 @@ def _check_certificates(link: LinkConfig) -> None:
 
 
 _IN_USE = re.compile(r"Address already in use|EADDRINUSE|os error 98|os error 48")
-
-
-class RouterRefuses(LinkError):
-    """A router listens there, and one of the two certificates is not accepted."""
-
-
-_PROBE_S = 1.0
-"""How long is looked for what listens where no link came about [s]."""
-
-
-def no_router(link: LinkConfig) -> LinkError:
-    """The error that says why there is no link to a router where ``link`` looks for it."""
-    for endpoint in link.connect:
-        if (found := _why_no_link(link, endpoint)) is not None:
-            return found
-    return LinkError(
-        f"no router at {', '.join(link.connect)}",
-        remedy="start one with `palpate up`, or name yours with --connect",
-    )
-
-
-def _why_no_link(link: LinkConfig, endpoint: str) -> LinkError | None:
-    """What listens at an endpoint and does not link; None = nothing does."""
-    protocol, _, place = endpoint.partition("/")
-    host, port = endpoint_host_port(endpoint)
-    try:
-        with socket.create_connection((host, port), timeout=_PROBE_S) as plain:
-            if protocol == "tls" and link.tls is not None:
-                _shake_hands(link.tls, plain, host)
-    except ssl.SSLCertVerificationError as error:
-        return RouterRefuses(
-            f"the certificate of {endpoint} does not hold here: {error.verify_message}",
-            remedy="take both certificates from one authority: palpate certs show FOLDER",
-        )
-    except ssl.SSLError as error:
-        if "ALERT" in (error.reason or ""):
-            why = str(error.reason).partition("ALERT_")[2].replace("_", " ").lower()
-            return RouterRefuses(
-                f"{endpoint} refuses the certificate {link.tls and link.tls.certificate}: {why}",
-                remedy="see when it ends and whose it is: palpate certs show FOLDER; issue "
-                "another by the authority of that router: palpate certs issue",
-            )
-        return LinkError(
-            f"what listens at {endpoint} does not speak TLS, or its certificates cannot be read",
-            remedy=f"without certificates connect to tcp/{place}; see yours: palpate certs show",
-        )
-    except OSError:
-        return None
-    hint = f"connect to tls/{place} if it wants certificates; " if protocol == "tcp" else ""
-    return LinkError(
-        f"something listens at {endpoint}, but no link comes about: it hangs, or is no router of "
-        "this kind",
-        remedy=f"{hint}look at it with `palpate status`, or name your router with --connect",
-    )
-
-
-def _shake_hands(tls: TlsConfig, plain: socket.socket, host: str) -> None:
-    """Show the certificate as a link does; raises what either side has against it."""
-    context = ssl.create_default_context(cafile=str(tls.root_ca_certificate))
-    context.load_cert_chain(tls.certificate, tls.private_key)
-    with context.wrap_socket(plain, server_hostname=host) as shown:
-        # In TLS 1.3 a refusal comes only after the handshake; else the router waits for us.
-        with contextlib.suppress(TimeoutError):
-            shown.recv(1)
 
 
 def open_zenoh(link: LinkConfig, mode: str, *, also_listen: Sequence[str] = ()) -> zenoh.Session:
