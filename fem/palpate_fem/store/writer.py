@@ -313,7 +313,8 @@ def export(
                     group = f"{TRAJECTORIES}/{name}"
                     _copy(store.path / f"{group}.h5", group, target)
         except (OSError, RuntimeError) as error:
-            raise disk_error(path, OSError(str(error))) from error
+            told = error if isinstance(error, OSError) else OSError(str(error))
+            raise disk_error(path, told) from error
         claim.finish()
     return len(names)
 

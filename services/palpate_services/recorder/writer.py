@@ -57,7 +57,8 @@ def disk_error(folder: Path, why: str) -> DiskError:
         left = "free space unknown"
     return DiskError(
         f"recording to {folder} is paused: {why} ({left})",
-        remedy="free some space or change recorder.out; recording resumes by itself",
+        remedy="free some space, see that the folder may be written, or change recorder.out; "
+        "recording resumes by itself",
     )
 
 
