@@ -152,17 +152,17 @@ def _sensors(profile: Profile) -> Found:
 
 def _unserved(profile: Profile) -> list[str]:
     """Sensors that the services of a station of this host alone name, and its gateway has not."""
-    if not all(is_loopback(endpoint_host_port(one)[0]) for one in profile.router.listen):
+    here = all(is_loopback(endpoint_host_port(one)[0]) for one in profile.router.listen)
+    if "router" not in profile.processes or not here:
         return []
     has = {sensor.name for sensor in profile.gateway.sensors}
-    named = [
+    return [
         f"{sensor} ([{service}])"
         for service, table in (("features", profile.features), ("field", profile.field))
         if service in profile.processes
         for sensor in dict.fromkeys([*table.sensors, *table.bundles])
         if sensor not in has
     ]
-    return named if "router" in profile.processes else []
 
 
 def _router(profile: Profile) -> Found:

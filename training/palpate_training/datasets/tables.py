@@ -297,7 +297,7 @@ def _provenance(table: pa.Table) -> dict[str, str]:
     """What a file of ours says of its rows; nothing of a file of others."""
     try:
         facts = json.loads((table.schema.metadata or {})[METADATA])["provenance"]
-        return {name: str(facts[name]) for name in ("source", "licence")}
+        return {name: str(facts[name]) for name in PROVENANCE_COLUMNS}
     except (KeyError, TypeError, ValueError):
         pass
     if not {*columns_of("electrodes"), *PROVENANCE_COLUMNS} <= set(table.column_names):
