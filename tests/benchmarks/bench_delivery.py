@@ -26,8 +26,8 @@ import zenoh
 
 from palpate.bus import run_router
 from palpate.bus.delivery import NewestQueue
-from palpate.bus.link import open_zenoh
 from palpate.bus.ring import Alarm, Ring
+from palpate.bus.zenoh_session import open_zenoh
 from palpate.config import LinkConfig
 from palpate.process import avoid_pauses
 

@@ -25,8 +25,8 @@ import zenoh
 
 from palpate import Client, clock
 from palpate.bus import Delivery, Subscriber
-from palpate.bus.link import open_zenoh
 from palpate.bus.topics import ELECTRODES, FEATURES, STATUS, live_key
+from palpate.bus.zenoh_session import open_zenoh
 from palpate.client.simulations import GRACE_S, straight_path
 from palpate.config import joining_link
 from palpate.errors import PalpateError, RemoteError, StaleError, StreamTimeout

@@ -21,8 +21,8 @@ import zenoh
 
 from palpate import Client
 from palpate.bus import Delivery, endpoints
-from palpate.bus.link import open_zenoh
 from palpate.bus.topics import ELECTRODES, ENCODING_PREFIX, FEATURES, sensor_key
+from palpate.bus.zenoh_session import open_zenoh
 from palpate.client.simulations import straight_path
 from palpate.codec import SIMULATION_REQUEST
 from palpate.config import joining_link

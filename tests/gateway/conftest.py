@@ -20,7 +20,7 @@ from palpate.bus import Delivery, Session, Tap, endpoints
 from palpate.bus.topics import TOPICS, sensor_key
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import PalpateError
-from palpate.files.record import RecordWriter
+from palpate.files.record_writer import RecordWriter
 from palpate.files.tape import write_tape
 from palpate.messages import ServiceRequest, ServiceState, Status, Tare, TareRequest
 from palpate_gateway.clock.stamps import FileClock

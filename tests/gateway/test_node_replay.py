@@ -15,7 +15,8 @@ import pytest
 from palpate.bus.topics import TOPICS
 from palpate.codec import TARE
 from palpate.errors import RecordingError, RemoteError
-from palpate.files.record import RecordWriter, read_record
+from palpate.files.record import read_record
+from palpate.files.record_writer import RecordWriter
 from palpate.messages import ElectrodeFrame, Origin, ServiceState
 
 PATIENCE_S = 30.0

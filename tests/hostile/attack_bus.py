@@ -22,8 +22,8 @@ from tests.hostile.victim import Victim
 
 from palpate.admin import new_nonce, signed
 from palpate.bus import Session, endpoints
-from palpate.bus.link import open_zenoh
 from palpate.bus.topics import SensorClaim, claim_key, sensor_key, service_key
+from palpate.bus.zenoh_session import open_zenoh
 from palpate.client.estimates import ask_tare
 from palpate.client.models import ModelAdmin
 from palpate.config import Role

@@ -13,7 +13,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from palpate.bus.topics import ELECTRODES, SCHEMAS, sensor_key
-from palpate.files.record import METADATA, RecordWriter, descriptor_set
+from palpate.files.record_writer import METADATA, RecordWriter, descriptor_set
 
 Case = Callable[[Path], None]
 

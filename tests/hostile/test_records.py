@@ -11,8 +11,9 @@ from tests.hostile import trial
 from tests.hostile.records import CASES, KEY, NOW_NS, SCHEMA, write_good
 
 from palpate.errors import RecordingError, WireError, printable
-from palpate.files import record as record_module
-from palpate.files.record import RecordWriter, check_readable, recover, summarise
+from palpate.files import record_writer
+from palpate.files.record import check_readable, recover, summarise
+from palpate.files.record_writer import RecordWriter
 
 MEMORY_BYTES = 150 << 20
 """Twice the largest chunk that is allowed, packed and expanded, and some."""
@@ -71,7 +72,7 @@ def test_recovery_passes_many_heads_of_chunks_that_are_not_there(tmp_path: Path)
 def test_the_writer_takes_no_more_streams_than_the_reader(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(record_module, "CHANNELS_MAX", 5)
+    monkeypatch.setattr(record_writer, "CHANNELS_MAX", 5)
     with RecordWriter(tmp_path / "a.mcap") as writer:
         for number in range(5):
             writer.write(f"{KEY}{number}", SCHEMA, b"x", log_time_ns=NOW_NS)

@@ -22,8 +22,8 @@ import zenoh
 
 from palpate import AsyncClient, Client
 from palpate.bus import Session, endpoints, run_router
-from palpate.bus.link import close_zenoh
 from palpate.bus.topics import FEATURES
+from palpate.bus.zenoh_session import close_zenoh
 from palpate.client.simulations import straight_path
 from palpate.config import LinkConfig
 from palpate.errors import (

@@ -21,14 +21,8 @@ from mcap.reader import make_reader
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, sensor_key
 from palpate.codec import ELECTRODE_FRAME, WRENCH_FRAME
 from palpate.errors import RecordingError, WireError
-from palpate.files.record import (
-    RecordWriter,
-    check_readable,
-    descriptor_set,
-    read_record,
-    recover,
-    summarise,
-)
+from palpate.files.record import check_readable, read_record, recover, summarise
+from palpate.files.record_writer import RecordWriter, descriptor_set
 
 KEY = sensor_key("lab", "finger", "electrodes")
 
@@ -290,7 +284,7 @@ def test_a_full_disk_is_named(tmp_path: Path, payload: bytes) -> None:
 _CHILD = """
 import sys, time
 from pathlib import Path
-from palpate.files.record import RecordWriter
+from palpate.files.record_writer import RecordWriter
 writer = RecordWriter(Path(sys.argv[1]))
 payload = sys.stdin.buffer.read()
 i = 0
@@ -320,7 +314,7 @@ def test_a_record_with_half_a_write_in_it_never_looks_whole(
 ) -> None:
     """Also where there is room again for the end: a chaos run found such a file."""
     with monkeypatch.context() as patch:
-        opened = "palpate.files.record.open"
+        opened = "palpate.files.record_writer.open"
         patch.setattr(opened, lambda path, _: FillingDisk(io.FileIO(path, "xb")), raising=False)
         writer = RecordWriter(tmp_path / "run.mcap")
     writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=1)
@@ -339,7 +333,7 @@ def test_a_record_with_half_a_write_in_it_never_looks_whole(
 def test_nothing_is_left_of_a_record_that_could_not_begin(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened = "palpate.files.record.open"
+    opened = "palpate.files.record_writer.open"
     monkeypatch.setattr(opened, lambda path, _: FillingDisk(io.FileIO(path, "xb")), raising=False)
     FillingDisk.full = True
     with pytest.raises(RecordingError, match="No space left"):

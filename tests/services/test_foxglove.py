@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from palpate.bus.topics import TOPICS, sensor_key
 from palpate.errors import ConfigError, RecordingError
-from palpate.files.record import RecordWriter, read_record
+from palpate.files.record import read_record
+from palpate.files.record_writer import RecordWriter
 from palpate.messages import ElectrodeFrame, FeatureEstimate, IndenterPoseFrame, Tare, WrenchFrame
 from palpate_services.viewer.foxglove import export_foxglove
 from palpate_services.viewer.record_view import ARROW_M_PER_N

@@ -17,8 +17,9 @@ from palpate.bus import TapSample
 from palpate.bus.topics import ELECTRODES, TARE, sensor_key
 from palpate.codec import ELECTRODE_FRAME
 from palpate.errors import ErrorCode, RecordingError
-from palpate.files import record as record_module
-from palpate.files.record import RecordWriter, check_readable, read_record, summarise
+from palpate.files import record_writer
+from palpate.files.record import check_readable, read_record, summarise
+from palpate.files.record_writer import RecordWriter
 from palpate.health import Health
 from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
 from palpate_services.config import RecorderConfig
@@ -129,7 +130,7 @@ def test_broken_payload_is_kept_and_counted(open_files: Any, tmp_path: Path) -> 
 def test_invented_names_are_counted_and_cost_the_others_nothing(
     open_files: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(record_module, "CHANNELS_MAX", 10)
+    monkeypatch.setattr(record_writer, "CHANNELS_MAX", 10)
     with open_files() as (files, health):
         for number in range(100):
             files.write(sample_of(b"x", f"finger{number}"))

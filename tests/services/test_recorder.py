@@ -21,7 +21,8 @@ from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.topics import ELECTRODES, FEATURES, POSE, STATUS, TARE, WRENCH, sensor_key
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, ErrorCode, StreamTimeout
-from palpate.files.record import RecordWriter, read_record
+from palpate.files.record import read_record
+from palpate.files.record_writer import RecordWriter
 from palpate.messages import (
     ElectrodeFrame,
     Origin,

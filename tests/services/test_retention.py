@@ -11,7 +11,7 @@ import pytest
 
 from palpate.bus.topics import ELECTRODES, sensor_key
 from palpate.errors import ConfigError
-from palpate.files.record import RecordWriter
+from palpate.files.record_writer import RecordWriter
 from palpate.health import Health
 from palpate_services.config import EVERYTHING, RecorderConfig
 from palpate_services.recorder import retention

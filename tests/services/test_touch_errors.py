@@ -13,7 +13,7 @@ import pytest
 
 from palpate.bus.topics import TOPICS, sensor_key
 from palpate.errors import RecordingError
-from palpate.files.record import RecordWriter
+from palpate.files.record_writer import RecordWriter
 from palpate.messages import (
     ElectrodeFrame,
     ErrorBounds,

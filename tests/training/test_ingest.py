@@ -10,7 +10,7 @@ import pytest
 
 from palpate.bus.topics import ELECTRODES, POSE, TARE, WRENCH, Topic, sensor_key
 from palpate.errors import DatasetError, RecordingError
-from palpate.files.record import RecordWriter
+from palpate.files.record_writer import RecordWriter
 from palpate.messages import (
     ElectrodeFrame,
     IndenterPoseFrame,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from palpate.bus.topics import ELECTRODES, POSE, WRENCH, sensor_key
-from palpate.files.record import RecordWriter
+from palpate.files.record_writer import RecordWriter
 from palpate.messages import (
     ElectrodeFrame,
     IndenterPoseFrame,

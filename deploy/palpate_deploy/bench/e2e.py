@@ -169,7 +169,7 @@ def measure_latency(*, seconds: float, rounds: int, bundle: str, model: Path, ba
 
 
 def _start_floor(children: FiniteRun, model: Path, out: Path, gates: Path, core: str) -> None:
-    from palpate.bus.link import zenoh_config
+    from palpate.bus.zenoh_session import zenoh_config
 
     # Palpate's Zenoh settings as files, so that both sides have the same.
     endpoint = free_endpoint()

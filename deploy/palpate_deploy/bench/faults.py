@@ -27,7 +27,6 @@ from rich.table import Table
 
 from palpate import clock
 from palpate.bus import Delivery, endpoints
-from palpate.bus.link import open_zenoh
 from palpate.bus.topics import (
     ELECTRODES,
     ENCODING_PREFIX,
@@ -36,6 +35,7 @@ from palpate.bus.topics import (
     STATUS,
     sensor_key,
 )
+from palpate.bus.zenoh_session import open_zenoh
 from palpate.codec import ELECTRODE_FRAME, ERROR, TARE_REQUEST
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, ErrorCode, PalpateError, StaleError, StreamTimeout

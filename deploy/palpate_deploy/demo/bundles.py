@@ -10,7 +10,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from palpate.bus.topics import ELECTRODES, TOPICS, sensor_key
 from palpate.errors import BundleError
-from palpate.files.record import RecordWriter
+from palpate.files.record_writer import RecordWriter
 from palpate.process import require
 from palpate_gateway.clock.stamps import DueMessage, FileClock
 from palpate_gateway.drivers import make_device

@@ -21,8 +21,9 @@ import zenoh
 
 from palpate.bus.access import DOOR_PROTOCOL, DOOR_ROOT, ROLE_OF
 from palpate.bus.claims import SensorClaims
-from palpate.bus.link import Session, close_zenoh, open_zenoh, zenoh_config
+from palpate.bus.link import Session
 from palpate.bus.topics import STATION_ROOT
+from palpate.bus.zenoh_session import close_zenoh, open_zenoh, zenoh_config
 from palpate.config import LinkConfig
 from palpate.errors import ClaimedElsewhere, LinkError
 from palpate.heartbeat import FILE_VARIABLE, beat

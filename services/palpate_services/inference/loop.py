@@ -23,8 +23,8 @@ from palpate import clock
 from palpate.admin import make_token, token_file
 from palpate.bus import Delivery, Publisher, ReceivedMessage, Session, Subscriber, endpoints
 from palpate.bus.claims import SETTLE_S
-from palpate.bus.link import LOSSLESS_STALL_S
 from palpate.bus.topics import Topic
+from palpate.bus.zenoh_session import LOSSLESS_STALL_S
 from palpate.codec import STAGE_TIMINGS
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, ErrorCode, RemoteError, WireError

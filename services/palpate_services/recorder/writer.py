@@ -17,7 +17,8 @@ from typing import Any
 from palpate.bus import TapSample
 from palpate.bus.topics import FIELD, FIELD_TRUTH, TARE, TOPICS, Topic, sensor_key
 from palpate.errors import ErrorCode, RecordingError, WireError
-from palpate.files.record import RecordGone, RecordWriter, Recovery, is_being_written, recover
+from palpate.files.record import Recovery, is_being_written, recover
+from palpate.files.record_writer import RecordGone, RecordWriter
 from palpate.health import Health
 from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
 from palpate_services.config import RecorderConfig

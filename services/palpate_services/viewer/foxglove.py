@@ -21,7 +21,8 @@ from mcap.writer import CompressionType, Writer
 from palpate.bus.topics import SCHEMAS, TOPICS
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
-from palpate.files.record import descriptor_set, metadata_of, read_record
+from palpate.files.record import metadata_of, read_record
+from palpate.files.record_writer import descriptor_set
 from palpate.process import require
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.viewer.layout import (

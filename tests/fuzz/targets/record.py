@@ -13,7 +13,8 @@ from tests.gateway.pipelines import pushed
 from palpate.bus.topics import TOPICS, sensor_key
 from palpate.codec import ELECTRODE_FRAME
 from palpate.errors import ConfigError, RecordingError
-from palpate.files.record import descriptor_set, summarise
+from palpate.files.record import summarise
+from palpate.files.record_writer import descriptor_set
 from palpate_gateway.clock.stamps import FileClock
 from palpate_gateway.drivers import make_device
 from palpate_gateway.readings import RecordedMessage

@@ -12,7 +12,7 @@ import pytest
 
 from palpate.bus.topics import ROBOT_POSE, sensor_key
 from palpate.errors import ConfigError, RecordingError
-from palpate.files.record import RecordWriter
+from palpate.files.record_writer import RecordWriter
 from palpate.messages import RobotPoseFrame
 from palpate_gateway.drivers import make_device
 from palpate_gateway.readings import PoseReading

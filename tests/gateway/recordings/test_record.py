@@ -7,7 +7,8 @@ import pytest
 
 from palpate.bus.topics import FEATURES, sensor_key
 from palpate.errors import ConfigError, RecordingError
-from palpate.files.record import RecordWriter, read_record
+from palpate.files.record import read_record
+from palpate.files.record_writer import RecordWriter
 from palpate_gateway.drivers import make_device
 from palpate_gateway.readings import RecordedMessage
 from palpate_gateway.recordings.record import recorded_sensors

@@ -1,0 +1,158 @@
+"""Sessions of Zenoh: their settings, and why one does not open."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import zenoh
+
+from palpate.bus import access
+from palpate.bus.no_router import no_router
+from palpate.bus.topics import (
+    MAX_MESSAGE_BYTES,
+)
+from palpate.config import LinkConfig
+from palpate.errors import ConfigError, LinkError
+
+_log = logging.getLogger(__name__)
+
+INDIRECT_WAIT_S = 60.0
+"""Without direct links opening blocks until the router answers; it gives up after this time [s]."""
+
+LOSSLESS_STALL_S = 60.0
+"""How long a lossless (replay) publisher may be blocked before its link is closed."""
+
+
+def zenoh_config(link: LinkConfig, mode: str) -> zenoh.Config:
+    """Settings of a session of ``mode`` ``"peer"``, ``"client"`` or ``"router"``.
+
+    Raises:
+        ConfigError: A router is to be reached without certificates, although roles are asked for.
+    """
+    _check_certificates(link)
+    client = mode == "client"
+    wait_s = INDIRECT_WAIT_S if link.wait_for_router_s < 0 else link.wait_for_router_s
+    settings: dict[str, Any] = {
+        "mode": mode,
+        # A peer retries in the background without end; Session.open waits and names what is
+        # missing. A client cannot open without its router.
+        "connect": {
+            "endpoints": list(link.connect),
+            "timeout_ms": round(wait_s * 1000) if client else -1,
+            "exit_on_failure": client,
+            "retry": {
+                "period_init_ms": 200,
+                "period_max_ms": 1000,
+                "period_increase_factor": 1.5,
+            },
+        },
+        "listen": {
+            "endpoints": [] if client else list(link.listen),
+            "timeout_ms": 0,
+            "exit_on_failure": True,
+        },
+        # The router introduces peers to one another; their data then flows on direct links.
+        "scouting": {
+            "multicast": {"enabled": False},
+            "gossip": {
+                "enabled": True,
+                "autoconnect": {"router": [], "peer": ["router", "peer"]},
+            },
+        },
+        # Do not wait for peers that may not exist; Session.open waits for the router itself.
+        "open": {"return_conditions": {"connect_scouted": False, "declares": True}},
+        "timestamping": {"enabled": False},
+        "transport": {
+            "shared_memory": {"enabled": False},
+            "link": {
+                "tx": {
+                    "lease": round(link.lease_s * 1000),
+                    "keep_alive": 4,
+                    "queue": {
+                        # Express messages take a batch each: with the default of two, twenty
+                        # sensors that publish in the same millisecond lose frames.
+                        "size": {"real_time": 16, "data_high": 16},
+                        "congestion_control": {
+                            "drop": {"wait_before_drop": 2000},
+                            "block": {"wait_before_close": round(LOSSLESS_STALL_S * 1e6)},
+                        },
+                    },
+                },
+                "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+            },
+        },
+    }
+    if link.tls is not None:
+        settings["transport"]["link"]["tls"] = {
+            "root_ca_certificate": str(link.tls.root_ca_certificate),
+            "enable_mtls": True,
+            "listen_certificate": str(link.tls.certificate),
+            "listen_private_key": str(link.tls.private_key),
+            "connect_certificate": str(link.tls.certificate),
+            "connect_private_key": str(link.tls.private_key),
+            # A certificate that has expired ends the links that it opened, too.
+            "close_link_on_expiration": True,
+        }
+        if link.tls.roles:
+            # Somebody with a certificate may announce a listener without: nobody connects there.
+            settings["transport"]["link"]["protocols"] = ["tls", access.DOOR_PROTOCOL]
+            settings |= access.settings()
+    return zenoh.Config.from_json5(json.dumps(settings))
+
+
+def _check_certificates(link: LinkConfig) -> None:
+    if link.certificates is not None:
+        raise ConfigError(
+            f"{link.certificates} holds certificates by role, and this process has no role",
+            remedy="name the folder of one role: --tls FOLDER/operator",
+        )
+    plain = [end for end in link.connect if not end.startswith("tls/")]
+    if link.has_roles and plain:
+        raise ConfigError(
+            f"{plain[0]} shows no certificate, so that nothing it says would be believed",
+            remedy=f"connect to tls/{plain[0].partition('/')[2]}, or set tls.roles = false",
+        )
+
+
+_IN_USE = re.compile(r"Address already in use|EADDRINUSE|os error 98|os error 48")
+
+
+def open_zenoh(link: LinkConfig, mode: str, *, also_listen: Sequence[str] = ()) -> zenoh.Session:
+    """Open a Zenoh session and translate why it does not open.
+
+    ``also_listen`` are endpoints of any protocol of Zenoh that are not offered to others.
+
+    Raises:
+        LinkError: A port is in use, or a client finds no router.
+    """
+    config = zenoh_config(link, mode)
+    if also_listen:
+        config.insert_json5("listen/endpoints", json.dumps([*link.listen, *also_listen]))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        if _IN_USE.search(str(error)):
+            raise LinkError(
+                f"port in use: {', '.join(link.listen)}",
+                remedy=(
+                    "another palpate runs there (palpate status); stop it or choose another "
+                    "port for the listener"
+                ),
+            ) from error
+        if mode == "client":
+            raise no_router(link) from error
+        raise LinkError(
+            f"cannot join the bus: {error}", remedy="check the [link] table of the profile"
+        ) from error
+
+
+def close_zenoh(session: zenoh.Session) -> None:
+    """Close a Zenoh session; where its router hangs, it is given up, with a warning."""
+    try:
+        session.close()
+    except zenoh.ZError:
+        _log.warning("left the bus without its answer: its router hangs")
