@@ -122,6 +122,21 @@ def test_dry_run_prints_every_file_and_writes_none(
         assert f"# ---- /{path}\n{(root / path).read_text('utf-8')}" in said
 
 
+def test_dry_run_shows_what_the_install_would_write_and_what_would_stop_it(
+    root: Path, profile: Path, install: Install, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install(allowed=("192.0.2.0/24",))
+    order = InstallOrder(str(profile), "", root, PROGRAM)
+    capsys.readouterr()
+    service.show_plan(order)
+    assert f"# ---- /{UNIT}\n{(root / UNIT).read_text('utf-8')}" in capsys.readouterr().out
+    (root / UNIT).write_text("mine")
+    before = contents(root)
+    with pytest.raises(InstallError, match="changed since"):
+        service.show_plan(order)
+    assert difference(before, contents(root)) == []
+
+
 def test_uninstall_keeps_profile_recordings_and_models(root: Path, install: Install) -> None:
     install()
     *data, kernel = _leave_data(root)

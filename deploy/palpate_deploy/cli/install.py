@@ -36,7 +36,8 @@ def install(
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print the files, and write nothing.")
+        bool,
+        typer.Option("--dry-run", help="Print the files and what would stop it; write nothing."),
     ] = False,
     rollback: Annotated[
         bool, typer.Option("--rollback", help="Restore what was installed before the last change.")

@@ -248,6 +248,44 @@ class Journal(StrictConfig):
     found: dict[str, str]
 
 
+def ledger_of(host: Host, name: str) -> Ledger:
+    """What is installed of a station; an empty ledger if nothing is.
+
+    Raises:
+        InstallError: The ledger is damaged.
+        PermissionError: It is read by somebody else than root.
+    """
+    file = _ledger_file(host, name)
+    try:
+        ledger = Ledger.model_validate_json(file.read_bytes())
+    except FileNotFoundError:
+        return Ledger()
+    except ValidationError as error:
+        raise InstallError(
+            f"{file} is damaged",
+            remedy=f"look at {', '.join(paths_of(name))}; remove what is not wanted, and {file}",
+        ) from error
+    if strange := sorted(ledger.written_paths - set(paths_of(name))):
+        raise InstallError(
+            f"{file} names {strange[0]}, which no install writes",
+            remedy="somebody has changed it: restore it from a backup",
+        )
+    return ledger
+
+
+def is_half_way(host: Host, name: str) -> bool:
+    """Whether a change was begun and not ended; `Books` undo it."""
+    return _journal_file(host, name).exists()
+
+
+def _ledger_file(host: Host, name: str) -> Path:
+    return host.at(LEDGERS_FOLDER / f"{name}.json")
+
+
+def _journal_file(host: Host, name: str) -> Path:
+    return host.at(LEDGERS_FOLDER / f"{name}.json.next")
+
+
 class Books:
     """The ledger of one station on a host. Use it while the host is ``locked``.
 
@@ -257,33 +295,14 @@ class Books:
     def __init__(self, host: Host, name: str) -> None:
         self.host = host
         self.name = name
-        self._file = host.at(LEDGERS_FOLDER / f"{name}.json")
-        self._journal = self._file.with_name(f"{name}.json.next")
+        self._file = _ledger_file(host, name)
+        self._journal = _journal_file(host, name)
         self.undone = self._undo()
         """Whether a change was undone."""
 
     def read(self) -> Ledger:
-        """What is installed; an empty ledger if nothing is.
-
-        Raises:
-            InstallError: The ledger is damaged.
-        """
-        try:
-            ledger = Ledger.model_validate_json(self._file.read_bytes())
-        except FileNotFoundError:
-            return Ledger()
-        except ValidationError as error:
-            raise InstallError(
-                f"{self._file} is damaged",
-                remedy=f"look at {', '.join(paths_of(self.name))}; remove what is not wanted, and "
-                f"{self._file}",
-            ) from error
-        if strange := sorted(ledger.written_paths - set(paths_of(self.name))):
-            raise InstallError(
-                f"{self._file} names {strange[0]}, which no install writes",
-                remedy="somebody has changed it: restore it from a backup",
-            )
-        return ledger
+        """What is installed: see `ledger_of`."""
+        return ledger_of(self.host, self.name)
 
     def change(self, ledger: Ledger, then: Callable[[], None]) -> None:
         """Write everything of ``ledger.now``; remove what was installed and is not in it.

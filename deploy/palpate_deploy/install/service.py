@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -21,6 +22,8 @@ from palpate_deploy.install.ledger import (
     Host,
     InstallError,
     Ledger,
+    is_half_way,
+    ledger_of,
     paths_of,
 )
 from palpate_deploy.install.plan import (
@@ -43,16 +46,30 @@ from palpate_deploy.station.host import check_free
 
 
 def show_plan(order: InstallOrder) -> None:
-    """Print every file that an install would write; needs no rights.
+    """Print every file that an install would write, and then what would stop it; needs no rights.
 
     Raises:
         ConfigError: Profile, name or program are wrong.
+        InstallError: A file of somebody else is in the way.
+        LinkError: On a first install: the router's port is in use.
         MissingExtraError: A process needs a package that is not installed.
     """
-    name = order.station
-    plan, profile = make_plan(order, STATES_FOLDER / name, program_of(order))
-    for path, text in {str(profile_path(name)): profile, **plan.files()}.items():
-        print(f"# ---- {path}\n{text}")
+    host = Host(order.root)
+    with _errors_translated():
+        old, unknown = Ledger(), ""
+        try:
+            old = ledger_of(host, order.station)
+            if is_half_way(host, order.station):
+                unknown = "an install was killed half-way; the next one undoes it first"
+        except PermissionError:
+            unknown = "only root may read it"
+        order, plan, texts = _planned(order, old)
+        for path, text in texts.items():
+            print(f"# ---- {path}\n{text}")
+        if unknown:
+            print(f"not compared with what is installed: {unknown}", file=sys.stderr)
+        else:
+            _check_host(host, old, order, plan, texts)
 
 
 def install(order: InstallOrder) -> None:
@@ -64,26 +81,37 @@ def install(order: InstallOrder) -> None:
         LinkError: On a first install: the router's port is in use.
         MissingExtraError: A process needs a package that is not installed.
     """
-    name, program = order.station, program_of(order)
     _check_rights(order.root)
     with _errors_translated(), Host(order.root).locked() as host:
-        books = _open(host, name)
+        books = _open(host, order.station)
         old = books.read()
-        if old.now is not None and not order.allowed:
-            order = dataclasses.replace(order, allowed=old.now.allowed)
-        plan, profile = make_plan(order, STATES_FOLDER / name, program)
-        texts = {str(profile_path(name)): profile, **plan.files()}
-        edition = Edition.of(present_version(), program, order.allowed, texts)
-        _check_nothing_in_the_way(host, old, texts, profiles.profile_path(order.profile))
-        if host.is_this_host:
-            _check_this_host(plan.profile, first=old.now is None)
+        order, plan, texts = _planned(order, old)
+        edition = Edition.of(present_version(), plan.program, order.allowed, texts)
+        _check_host(host, old, order, plan, texts)
         if edition == old.now and all(
             host.look(path, {text}) is Found.OURS for path, text in texts.items()
         ):
-            print(f"station {name!r} is installed as it is: nothing has changed")
+            print(f"station {order.station!r} is installed as it is: nothing has changed")
         else:
             _change(books, Ledger(now=edition, before=old.now), plan.main_unit)
     _say_what_next(plan, host, upgraded=old.now is not None)
+
+
+def _planned(order: InstallOrder, old: Ledger) -> tuple[InstallOrder, ServicePlan, dict[str, str]]:
+    """The order with what an earlier one allowed, its plan, and the text of each file."""
+    if old.now is not None and not order.allowed:
+        order = dataclasses.replace(order, allowed=old.now.allowed)
+    name = order.station
+    plan, profile = make_plan(order, STATES_FOLDER / name, program_of(order))
+    return order, plan, {str(profile_path(name)): profile, **plan.files()}
+
+
+def _check_host(
+    host: Host, old: Ledger, order: InstallOrder, plan: ServicePlan, texts: dict[str, str]
+) -> None:
+    _check_nothing_in_the_way(host, old, texts, profiles.profile_path(order.profile))
+    if host.is_this_host:
+        _check_this_host(plan.profile, first=old.now is None)
 
 
 def roll_back(name: str, root: Path) -> None:
