@@ -11,7 +11,8 @@ import numpy.typing as npt
 import pytest
 
 from palpate.errors import BundleError
-from palpate.files.bundle import Manifest, read_bundle, write_bundle
+from palpate.files.bundle import read_bundle, write_bundle
+from palpate.files.manifest import Manifest
 from palpate.files.tasks import TASKS
 
 

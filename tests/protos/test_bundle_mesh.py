@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from palpate.errors import BundleError
 from palpate.files.bundle import (
     FieldMesh,
-    Manifest,
     mesh_from_bytes,
     mesh_to_bytes,
     read_bundle,
     read_mesh,
     write_bundle,
 )
+from palpate.files.manifest import Manifest
 from palpate.files.tasks import TASKS, check_tensors, tensors_of
 from palpate.messages import TensorInfo
 

@@ -12,7 +12,8 @@ import pytest
 from tests.protos.changed_manifest import change
 
 from palpate.errors import BundleError
-from palpate.files.bundle import MANIFEST, Manifest, read_bundle, write_bundle
+from palpate.files.bundle import MANIFEST, read_bundle, write_bundle
+from palpate.files.manifest import Manifest
 from palpate.files.tasks import TASKS
 from palpate.files.training_range import (
     KnownInputs,

@@ -14,7 +14,7 @@ from tests.protos.changed_manifest import change
 
 from palpate import codec
 from palpate.errors import BundleError, WireError
-from palpate.files.bundle import MANIFEST, Manifest, read_bundle, write_bundle
+from palpate.files.bundle import MANIFEST, read_bundle, write_bundle
 from palpate.files.intervals import (
     DISTANCE_MOST,
     TERMS,
@@ -23,6 +23,7 @@ from palpate.files.intervals import (
     bound_terms,
     bounds_of,
 )
+from palpate.files.manifest import Manifest
 from palpate.files.tasks import TASKS
 from palpate.files.training_range import (
     InputPattern,

@@ -14,7 +14,8 @@ import numpy.typing as npt
 import pytest
 
 from palpate import clock
-from palpate.files.bundle import Bundle, Manifest, read_bundle, write_bundle
+from palpate.files.bundle import Bundle, read_bundle, write_bundle
+from palpate.files.manifest import Manifest
 from palpate.files.tasks import TASKS, tensors_of
 from palpate.messages import (
     ElectrodeFrame,

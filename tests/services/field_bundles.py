@@ -12,7 +12,8 @@ import numpy as np
 import onnx
 from onnx import helper
 
-from palpate.files.bundle import FieldMesh, Manifest, write_bundle
+from palpate.files.bundle import FieldMesh, write_bundle
+from palpate.files.manifest import Manifest
 from palpate.files.tasks import tensors_of
 from palpate.messages import FieldEstimate, FieldFrame, FloatArray, Stamp
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from palpate.files.bundle import Manifest
 from palpate.files.intervals import TERMS, Intervals
+from palpate.files.manifest import Manifest
 from palpate.messages import TrainingRange, ValueRange
 
 TASK_WORDS = {

@@ -18,8 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import BundleError
-from palpate.files.bundle import Bundle, Manifest
+from palpate.files.bundle import Bundle
 from palpate.files.intervals import bound_terms, bounds_of
+from palpate.files.manifest import Manifest
 from palpate.files.training_range import InputPattern, KnownInputs, pattern_terms
 from palpate.messages import (
     ErrorBounds,

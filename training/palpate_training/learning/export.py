@@ -19,8 +19,9 @@ from torch import Tensor, nn
 from palpate import __version__
 from palpate.config import check_name
 from palpate.errors import BundleError, MissingExtraError
-from palpate.files.bundle import FieldMesh, Manifest, write_bundle
+from palpate.files.bundle import FieldMesh, write_bundle
 from palpate.files.intervals import Intervals
+from palpate.files.manifest import Manifest
 from palpate.files.tasks import TASKS, tensors_of
 from palpate.files.training_range import KnownInputs
 from palpate.messages import SensorType, TensorInfo, TrainingRange
