@@ -21,6 +21,7 @@ from palpate.bus.query import LONGEST_S
 from palpate.bus.topics import parse_key
 from palpate.config import LinkConfig, check_duration, parse_config
 from palpate.errors import ConfigError, LinkError, RecordingError, printable
+from palpate.files.outputs import check_output
 from palpate.files.record import RecordSummary, check_readable, recover, summarise
 from palpate.health import Health
 from palpate.process import stop_on_signals
@@ -157,16 +158,15 @@ def review_path(
     ``trajectories`` and ``most`` are for stores only, ``bundles`` for records: see the command.
 
     Raises:
-        ConfigError: There is no such path or bundle, or the name of a file to write has another
-            ending than its kind.
+        ConfigError: There is no such path or bundle, or a file cannot be written under its name.
         RecordingError: The record is damaged or not palpate's.
         DatasetError: The store is damaged, or has none of these trajectories.
         MissingExtraError: Rerun, h5py or matplotlib is not installed.
     """
     if not path.exists():
         raise ConfigError(f"{path} does not exist", remedy="check the path")
-    _check_ending(view, ".rrd", "--out")
-    _check_ending(picture, ".png", "--png")
+    check_output(view, "--out", ".rrd", path)
+    check_output(picture, "--png", ".png", path)
     from palpate.files.simulation_store import is_simulation_store
 
     if is_simulation_store(path):
@@ -187,14 +187,6 @@ def review_path(
                 print(line)
             print(printable(str(picture)))
         print(f"look at it: {viewer_command(written)}")
-
-
-def _check_ending(path: Path | None, ending: str, option: str) -> None:
-    """A file of another ending may be anything, e.g. the record itself; it would be replaced."""
-    if path is not None and path.suffix != ending:
-        raise ConfigError(
-            f"{option} {path} does not end in {ending}", remedy=f"name a file NAME{ending}"
-        )
 
 
 def write_foxglove(record: Path, out: Path, *, bundles: Sequence[str] = ()) -> None:

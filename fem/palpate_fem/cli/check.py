@@ -16,8 +16,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from palpate.errors import ConfigError
+from palpate.files.outputs import check_output
 from palpate_fem.calibration.result import without_nan
-from palpate_fem.cli.terminal import check_output, print_lines, print_table, progress_bar
+from palpate_fem.cli.terminal import print_lines, print_table, progress_bar
 
 if TYPE_CHECKING:
     from palpate_fem.study import PathRow, StudyRow

@@ -21,20 +21,14 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from palpate.errors import ConfigError
+from palpate.files.outputs import check_folder, check_output
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, recover
 from palpate_fem.calibration.result import Calibration, Evaluation, write_calibration
 from palpate_fem.calibration.runs import FingertipSimulator, simulate_all
 from palpate_fem.cli.model import FingertipModel, workers_for
-from palpate_fem.cli.terminal import (
-    check_folder,
-    check_output,
-    console,
-    print_lines,
-    print_table,
-    progress_bar,
-)
+from palpate_fem.cli.terminal import console, print_lines, print_table, progress_bar
 from palpate_fem.config import EDGE_M, FingertipParameters
 from palpate_fem.electrodes.model import ElectrodeModel
 from palpate_fem.electrodes.specimen import SpecimenParameters

@@ -18,6 +18,7 @@ import typer
 
 from palpate.config import joining_link, parse_config
 from palpate.errors import ConfigError
+from palpate.files.outputs import check_folder, check_output
 from palpate.files.simulation_store import SUFFIX
 from palpate.process import stop_on_signals, typed_command
 from palpate.rigid import path_lengths
@@ -25,15 +26,7 @@ from palpate_fem.arrays import Floats
 from palpate_fem.calibration.result import without_nan
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.cli.model import FingertipModel, workers_for
-from palpate_fem.cli.terminal import (
-    check_folder,
-    check_output,
-    console,
-    print_lines,
-    print_table,
-    progress_bar,
-    stop_on_signal,
-)
+from palpate_fem.cli.terminal import console, print_lines, print_table, progress_bar, stop_on_signal
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import parse_segments, read_path
