@@ -33,14 +33,13 @@ def rounded(a: Value, b: Value, radius: float) -> Value:
     At a right angle the edge becomes a circle of that radius, else an ellipse. Surfaces further
     than the radius from the edge do not change.
     """
-    u, v = np.maximum(a[0] + radius, 0.0), np.maximum(b[0] + radius, 0.0)
+    value, share = np.maximum(a[0], b[0]), (a[0] >= b[0]).astype(np.float64)
+    other = 1.0 - share
+    near = np.flatnonzero((a[0] > -radius) & (b[0] > -radius))
+    u, v = a[0][near] + radius, b[0][near] + radius
     length = np.hypot(u, v)
-    both = (u > 0) & (v > 0)
-    safe = np.where(both, length, 1.0)
-    share_a = np.where(both, u / safe, a[0] >= b[0])
-    share_b = np.where(both, v / safe, a[0] < b[0])
-    value = np.where(both, length - radius, np.maximum(a[0], b[0]))
-    return value, share_a[:, None] * a[1] + share_b[:, None] * b[1]
+    value[near], share[near], other[near] = length - radius, u / length, v / length
+    return value, share[:, None] * a[1] + other[:, None] * b[1]
 
 
 def offset(a: Value, distance: float) -> Value:
