@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from palpate.errors import ConfigError
 from palpate_fem.config import LIMITS
 from palpate_fem.population.fingertips import draw_fingertips
+from palpate_fem.population.members import draw_members
 
 DRAWN = ("skin_thickness_m", "shear_modulus_pa", "fluid_volume_m3", "friction_coefficient")
 
@@ -24,6 +26,19 @@ def test_values_spread_over_a_range_that_the_model_is_made_for(name: str) -> Non
     low, high = LIMITS[name]
     assert low < values[0] < 0.85 * values[-1] < 0.85 * high
     assert all(one < other for one, other in pairwise(values))
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_specimens_of_the_same_seed_tell_nothing_of_the_fingertips(name: str) -> None:
+    """Where each fingertip has one specimen of the same seed, as `data generate` may be told."""
+    tips = [getattr(tip, name) for tip in draw_fingertips(200, 5)]
+    specimens = [member.specimen for member in draw_members(200, 5)]
+    for told in (
+        *([one.core_offset_m[axis] for one in specimens] for axis in range(3)),
+        [one.sigma_s_m for one in specimens],
+        [one.noise_counts for one in specimens],
+    ):
+        assert abs(np.corrcoef(tips, told)[0, 1]) < 0.25
 
 
 def test_none_are_refused() -> None:

@@ -41,7 +41,9 @@ def draw_fingertips(count: int, seed: int) -> tuple[FingertipParameters, ...]:
 
 
 def _drawn(seed: int, number: int) -> FingertipParameters:
-    rng = np.random.default_rng([seed, number])
+    # Specimens are drawn with the key [seed, number]: with the same one a fingertip's skin would
+    # tell where its specimen's core sits.
+    rng = np.random.default_rng([seed, number, 1])
     return FingertipParameters(
         skin_thickness_m=rng.uniform(*SKIN_THICKNESS_M),
         shear_modulus_pa=math.exp(rng.uniform(*np.log(SHEAR_MODULUS_PA))),
