@@ -246,8 +246,12 @@ The table is of the {len(snapped)} trajectories that end early with neo-Hooke's 
 
 """
         + table(
-            ["strain stiffening", "reach full depth or 32 N", "force at the end, median [N]",
-             "iterations each"],
+            [
+                "strain stiffening",
+                "reach full depth or 32 N",
+                "force at the end, median [N]",
+                "iterations each",
+            ],
             rows,
         )
         + f"\nNot to full depth or 32 N, of all {len(whole)} with 0.004:\n\n"

@@ -88,9 +88,9 @@ def _fem() -> Iterator[Claim]:
     }
     yield Claim(
         "README.md",
-        "{ms192} ms a press (goals 100 and 30); two processes that share the GPU take {ms192xm} ms, "
-        "three with 384 presses at once {ms384xxm} ms. {ms16} ms with 16 presses at once, {ms1} ms "
-        "alone",
+        "{ms192} ms a press (goals 100 and 30); two processes that share the GPU take {ms192xm} ms,"
+        " three with 384 presses at once {ms384xxm} ms. {ms16} ms with 16 presses at once, {ms1} ms"
+        " alone",
         figures,
     )
     yield Claim(
@@ -314,8 +314,8 @@ def _demo() -> Iterator[Claim]:
     yield Claim(
         "README.md",
         "{touched} of the {estimates} frames have a touch of 0.5 N or more; their median error is"
-        " {force} N and {place} mm. From 0.5 to 1 N the median error of force is {light} N, from 8 N"
-        " on {hard} N. Over all frames, most of them untouched, it would be {all} N.",
+        " {force} N and {place} mm. From 0.5 to 1 N the median error of force is {light} N, from 8"
+        " N on {hard} N. Over all frames, most of them untouched, it would be {all} N.",
         figures,
     )
 
