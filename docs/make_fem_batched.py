@@ -142,8 +142,8 @@ def agreement(report: dict[str, Any], folder: Path) -> str:
             " difference of a component in any step, over the press's largest force. *Skin*:"
             " largest distance of a node after the last step. More than 1 um is another"
             " equilibrium; such a press is left out of medians and largest"
-            " values.\n\nGPU and core solve the same equations: with the default tolerances they differ by what these allow (above all 1 %"
-            " of the largest friction at a node).\n",
+            " values.\n\nGPU and core solve the same equations: with the default tolerances they"
+            " differ by what these allow (above all 1 % of the largest friction at a node).\n",
             markdown_table(head, table),
             "\n![agreement](fem-batched/agreement.png)",
         ]
