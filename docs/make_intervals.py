@@ -498,8 +498,8 @@ def page(facts: dict[str, Any]) -> str:
         markdown_table(BOUND_HEAD, bound_rows(simulated)),
         "\n*Off the goal by*: percentage points outside of 90 ± 3 %. *Bound*, *error*: medians over"
         " rows.\nWhere bounds were learned on ten other specimens, *presses* counts specimens.\n",
-        "## By true force\n\nEach cell: how often the bound holds (number of presses), and the median"
-        " bound.\n",
+        "## By true force\n\nEach cell: how often the bound holds (number of presses), and the"
+        " median bound.\n",
         markdown_table(BIN_HEAD, bin_rows(simulated)),
         "\n## Real fingers\n",
         REAL,
