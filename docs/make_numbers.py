@@ -104,7 +104,7 @@ def _fem() -> Iterator[Claim]:
         "and three with 384 slots **{ms384xxm} ms**",
         figures,
     )
-    yield Claim("docs/twin.md", "{ms192xxm} ms a press instead of {ms192}\n", figures)
+    yield Claim("docs/twin.md", "{ms192xxm} ms a press instead of {ms192},", figures)
     one, three = (
         f"{run['ms_a_trajectory']:.0f}" for run in _read("fem-batched/sweeps.json")["runs"][:2]
     )
