@@ -181,17 +181,16 @@ stay below [N] / median error of the angle [rad].
 * *Constant*: the mean force of the other finger; with presses, that of the labelled rows.
 * *Ridge*: a ridge regression on tared counts, which learns from the same rows.
 
-The next table is of the tare only, on electrodes that were changed as another finger or another day
-changes them. The change is of the logarithm of the impedance over that at rest, the same for all
-electrodes or different for each.
+With a tare only, on electrodes that were changed: the change is of the logarithm of the impedance
+over that at rest, of all electrodes alike or of each.
 
 {markdown_table(["", *head[1:], *(f"ridge, {name}" for name in names)], stressed)}
-The next table is of a finger that is learned from the first seconds of its own recording, as
-`palpate calibrate` does, and tested on all that comes later. No other finger and no state between
-frames is used, since a bundle can hold neither:
+A finger that is learned from the first seconds of its own recording, as by `palpate calibrate`, and
+tested on all that comes later. It uses no other finger, and no state between frames, which a bundle
+cannot hold:
 
 {markdown_table(["", *names], calibrated)}
-The last table is of fingers that training has met, at a later time: learned from the first
+Fingers that training has met, at a later time: learned from the first
 {100 * LEARNED:.0f} % of both recordings at once, tested on the rest of each, no setting changed
 (goals 0.12 and 0.16 N, 0.045 rad; the networks of the [study](study.md) have 0.085 and 0.33 N):
 
@@ -205,8 +204,7 @@ The last table is of fingers that training has met, at a later time: learned fro
 * A labelled press corrects most the rows within some ten seconds before and after it, because
   baselines wander. An estimate in real time has only the presses before it, so it gains less.
 * A finger's own first minute alone is worse than the other finger and five presses drawn from the
-  whole recording: baselines wander within a recording, and these fingers are never untouched, so
-  they cannot be tared again.
+  whole recording: baselines wander, and these fingers are never released to be tared again.
 * The constants of the method were chosen on these two fingers, by the worse of the two. So the
   numbers are somewhat too good; a third finger would be a test.
 * A single press makes the magnitude of the first finger worse. From two presses on, a ridge
@@ -263,8 +261,8 @@ pressed {report["presses"]} times, and drift as real ones do.
 * *Alike*: all other pairs. Here the size of the signals tells how sensitive the finger is: signals
   beyond {SAME_USE:g} times those of the other finger are scaled down, those from {SAME_USE**2:g}
   times on to the same size.
-* *Pressed harder*: only the harder half of the presses is in the recording. Then larger signals do
-  not mean a more sensitive finger, and the scaling could be wrong.
+* *Pressed harder*: only the harder half of the presses is in the recording, so that larger signals
+  do not mean a more sensitive finger.
 * *New*: {report["new_fingers"]} more fingers, with which nothing was chosen. The rules above and
   below were found on the other simulated fingers and on the real ones (training/LOG.md), whose
   signals differ by a factor of 1.4, so that nothing is scaled.
