@@ -106,8 +106,8 @@ CLAMP = """
 The long cylinder is as long as the finger. Where it is tilted towards the tip (`angled-0`), its
 other end meets the rim that the clamp holds: the force is that of the rim, not of a pinch.
 
-The skin *snaps* where the force of a ball or a cylinder falls while it is pressed in; the
-trajectory ends before that step. It happens where 1.2 to 1.4 mm of the 1.57 mm of skin are squeezed
+The skin *snaps* where the force falls while a ball or a cylinder moves in; the trajectory ends
+before that step. It happens where 1.2 to 1.4 mm of the 1.57 mm of skin are squeezed
 away. The force before the snap does not depend on the mesh: at 3.35 mm under `sphere_medium` it is
 12.15 N with edges of 0.6 mm and 12.14 N with 0.45 mm. The force at the snap does: 17 and 22.5 N. A
 volume barrier five times as stiff moves it to 22 N. So where the skin snaps is a property of the
@@ -331,15 +331,13 @@ a press of 0.5 to 2.5 mm, up to 30 degrees from the normal, then one to four seg
 2 mm, twist to 40 degrees, roll to 20 degrees, press further, unload in part), and out of the skin.
 **{len(whole)} of {len(rows)} ({len(whole) / len(rows):.1%}) complete** (the goal is 97 %).
 
-* *Left*: the largest displacement of a node after a whole path, {most:.4f} um at most. The goal,
-  0.01 um, is met by {near} of {len(whole)}. What is left comes from the tolerance of contact's
-  gaps, 1 nm; with a tolerance of 0.1 um the same paths left up to 0.1 um, and took 1 % fewer
-  iterations.
-* *Friction*: traction times slip times area, summed over increments. It must not give work back,
-  except that the solver's tolerance allows 1e-4 of a path's work in one increment.
-* The skin is at last as it was, so the work of the indenter should be that of friction. It is
-  {gap:.2f} times as much in the median: an increment's work is computed with the mean of the wrench
-  at both its ends, which misses how the wrench rises in between.
+* *Left*: the largest displacement of a node after a whole path, {most:.4f} um at most; {near} of
+  {len(whole)} meet the goal of 0.01 um. It comes from the tolerance of contact's gaps, 1 nm; with
+  0.1 um the same paths left up to 0.1 um, and took 1 % fewer iterations.
+* *Friction*: traction times slip times area, summed over increments. The solver's tolerance allows
+  that one increment gives back 1e-4 of a path's work.
+* The work of the indenter should be that of friction. It is {gap:.2f} times as much in the median,
+  because the mean of the wrench at both ends of an increment misses how it rises in between.
 
 """
         + table(
@@ -428,9 +426,8 @@ def recovery() -> str:
 
 `palpate fem recover --json` (and `--edge-mm 0.9 --seed N`): five indentations are
 simulated with thickness 1.45 mm, modulus 330 kPa and friction 0.25, and noise is added to each axis
-of the force. Then the calibration, which starts from a scan of its own, has to find these values;
-the table has its errors. The same simulator makes the forces and fits them, so this tests search
-and data processing, not the model.
+of the force. The calibration starts from its scan; the table has its errors. The same simulator
+makes the forces and fits them, so this tests search and data processing, not the model.
 
 """ + table(
         ["mesh", "noise [N]", "seed", "thickness [%]", "modulus [%]", "friction [%]", "volume [%]",
