@@ -72,9 +72,8 @@ def _latency() -> str:
             )
         )
     text = (
-        "The *floor* is the same path without palpate's code: router, source, service and client "
-        "over loopback TCP. Both take turns of a few seconds, so that they meet the same "
-        "disturbances of the host.\n\n"
+        "The *floor* is the same path without palpate's code. Both run in turns of a few seconds, "
+        "so that they meet the same disturbances of the host.\n\n"
     )
     text += _table(
         "frame stamp to estimate in the client | p50 | p99 | max | lost in all runs", rows
