@@ -549,9 +549,8 @@ FLAG_HEAD = ["bundle", "presses", "number", "falsely flagged", "95 % interval"]
 HEAD = """# How often the bounds of estimates hold
 
 A *bound* says how far an estimate may be off ([ADR 0031](../adr/0031-intervals.md)). Goal: a bound
-of 90 % holds in 90 ± 3 % of the rows, where each press counts the same. Written by
-`python docs/make_intervals.py runs ../shared/data`; the numbers are in
-[intervals.json](intervals.json).
+of 90 % holds in 90 ± 3 % of the rows, each press counting the same. Written by
+`python docs/make_intervals.py runs ../shared/data`; numbers in [intervals.json](intervals.json).
 
 ![How often bounds hold, by true force](intervals.png)
 
