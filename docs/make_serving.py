@@ -106,7 +106,7 @@ def _restarts() -> str:
     goals = {"kill": 3.0, "hang": 10.0, "end": 2.0}
     rows = []
     for trials in (*values["restart"], *more["restart"]):
-        # Of a process that is told to end, the time until the next one is there; others publish again.
+        # For a process that is told to end: until the next one is there. Others publish again.
         times = trials["process_s" if trials["fault"] == "end" else "publishing_s"]
         tried = len(times) + trials["failed"]
         rows.append(
