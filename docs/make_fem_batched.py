@@ -38,11 +38,13 @@ PAGE = FOLDER.with_suffix(".md")
 
 HEAD = """# Many indentations at once on a GPU
 
-Made by `python docs/make_fem_batched.py` of what the commands below measured;
-how it works: [ADR 26](../adr/0026-many-at-once.md). Presses are the twin's: nine indenters, 3 mm
-along the normal and 1.5 mm at 30 degrees to it, 20 steps, friction and core contact. At the end of
-a batch slots stand empty, as no press is left; in a long sweep that end is short, so the time with
-all slots taken is told, too.
+`python docs/make_fem_batched.py` makes this page from what the commands below measured. How it
+works: [ADR 26](../adr/0026-many-at-once.md). The presses are the twin's: nine indenters, 3 mm along
+the normal and 1.5 mm at 30 degrees to it, 20 steps, friction and core contact. A *trajectory* is
+one press; a *slot* is a place for one press on the GPU.
+
+At the end of a batch slots are empty, because no press is left. In a long sweep that end is short,
+so the table also has the time with all slots taken.
 """
 
 
@@ -136,12 +138,12 @@ def agreement(report: dict[str, Any], folder: Path) -> str:
     finish(figure, folder / "agreement.png", "GPU against CPU", "Dashed: the goals.")
     return "\n".join(
         [
-            "Each press is computed on a core, too, with the same tolerances. Forces: largest"
-            " difference of a component in any step, over the press's largest force. Skins: largest"
-            " distance of a node after the last step; more than 1 um is another equilibrium, and"
-            " left out of medians and largest values. So both solve the same equations: with the"
-            " default tolerances they differ by what these allow (1 % of the largest friction at a"
-            " node, above all).\n",
+            "Each press is also computed on a core, with the same tolerances. *Force*: largest"
+            " difference of a component in any step, over the press's largest force. *Skin*:"
+            " largest distance of a node after the last step. More than 1 um is another"
+            " equilibrium; such a press is left out of medians and largest"
+            " values.\n\nGPU and core solve the same equations: with the default tolerances they"
+            " differ by what these allow (above all 1 % of the largest friction at a node).\n",
             markdown_table(head, table),
             "\n![agreement](fem-batched/agreement.png)",
         ]
@@ -237,20 +239,20 @@ def main() -> None:
     sections = [
         HEAD,
         f"## Time\n\n{report['device']}: `{report['command']}` and `{meshes['command']}`. "
-        f"{report['told']} Processes that share a GPU: `--device cuda:0` as often as there are to"
-        " be processes. *MPS*: NVIDIA's Multi-Process Service was running"
-        " (`nvidia-cuda-mps-control -d`), so that kernels of all of them run at once.\n",
+        f"{report['told']}\n\n*Processes* on one GPU share the slots of their row; for several,"
+        " give `--device cuda:0` as often. *MPS*: NVIDIA's Multi-Process Service was running"
+        " (`nvidia-cuda-mps-control -d`), so that kernels of all processes run at once.\n",
         times(runs),
         "\n![time](fem-batched/time.png)\n",
-        f"Few slots, {few['device']}: `{few['command']}`, time of a trajectory with all slots"
-        f" taken. {few['told']}\n",
+        f"Few slots, {few['device']}: `{few['command']}`. The table has the time of a trajectory"
+        f" with all slots taken. {few['told']}\n",
         in_turns(few["runs"]),
         "",
         f"## Agreement with the solver on a core\n\n`{report['agreement_command']}`, and the same"
         f" with `--tightened 10`. {report['agreement_told']}\n",
         agreement(report, FOLDER),
         "\n## A factorisation and a solve\n",
-        f"All fronts: `{factor['command']}`. {factor['told']}\n",
+        f"All fronts are factorised: `{factor['command']}`. {factor['told']}\n",
         kernels(factor["runs"]),
         f"\n## Sweeps\n\n{sweeps['told']}\n",
         swept(sweeps["runs"]),
@@ -266,13 +268,13 @@ def main() -> None:
     asked = read("served.json")
     sections += [
         f"\n## Served\n\n{asked['device']}, `palpate fem serve --device cuda:0 --slots"
-        f" {asked['slots']}` behind a router, each caller with one request after the other:"
+        f" {asked['slots']}` behind a router; each caller sends one request after the other:"
         f" `{asked['command']}` (code of {asked['commit']}). *Bare*: the same presses in one"
-        " process, nothing between.\n",
+        " process, without the service.\n",
         served(asked),
-        f"\nThe solver's process killed (SIGKILL) while 32 callers had requests there:"
-        f" `{asked['killed']['command']}`. All were answered; workers began, and the next process"
-        " took over what still waited.\n",
+        f"\nThe solver's process was killed (SIGKILL) while 32 callers had requests there:"
+        f" `{asked['killed']['command']}`. All were answered: workers on cores took them first, the"
+        " next process of the solver took over what still waited.\n",
         served(asked["killed"]),
     ]
     PAGE.write_text("\n".join(sections) + "\n", encoding="utf-8")

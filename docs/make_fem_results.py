@@ -23,9 +23,10 @@ DATA = RESULTS / "fem"
 
 HEAD = """# The fingertip in finite elements: measured results
 
-Two cores of a shared virtual machine (its dense product reaches {peak:.0f} GFlop/s in double and
-{single:.0f} in single precision on both). `python docs/make_fem_results.py` writes this page from
-the output of the commands named below, which is kept in `fem/`.
+Measured on two cores of a shared virtual machine, unless a section names another. A dense matrix
+product on both cores reaches {peak:.0f} GFlop/s in double and {single:.0f} in single precision.
+`python docs/make_fem_results.py` writes this page from the output of the commands below, which is
+kept in `fem/`.
 """
 
 
@@ -81,20 +82,19 @@ def speed() -> str:
 ## Speed
 
 `palpate fem bench --json`: sphere of 7 mm, friction and core contact, 20 steps,
-{bench["system.unknowns"]:,.0f} unknowns; the goal is {bench["goal.trajectory_s"]:.0f} s, the
-paper's model took 420 s on
-six processors.
+{bench["system.unknowns"]:,.0f} unknowns. The goal is {bench["goal.trajectory_s"]:.0f} s; the
+paper's model took 420 s on six processors. The columns from *factorise* to *rest* are seconds, too.
 
 """
         + table(["indentation", "seconds", *PARTS, "iterations", "factorisations"], rows)
         + f"""
-Filling the fingertip takes {bench["pressurise.seconds"]:.1f} s, once. A whole factorisation is
-{bench["solver.factor_gflop"]:.1f} GFlop in {bench["solver.whole_factorisation_s"] * 1e3:.0f} ms:
-{bench["solver.factor_gflops"]:.0f} GFlop/s, {bench["solver.factor_share_of_single_peak"]:.0%}
-of the peak in single
-precision; a solve takes {bench["solver.solve_s"] * 1e3:.0f} ms and is bound by memory. Peak memory
-{bench["memory.peak_mib"]:.0f} MiB. The right picture below shows the cost
-against the size of the mesh.
+The fingertip is filled once, in {bench["pressurise.seconds"]:.1f} s. A whole factorisation takes
+{bench["solver.whole_factorisation_s"] * 1e3:.0f} ms for {bench["solver.factor_gflop"]:.1f} GFlop,
+that is {bench["solver.factor_gflops"]:.0f} GFlop/s or
+{bench["solver.factor_share_of_single_peak"]:.0%} of the peak in single precision. A solve takes
+{bench["solver.solve_s"] * 1e3:.0f} ms and is limited by memory bandwidth. Peak memory is
+{bench["memory.peak_mib"]:.0f} MiB. [Mesh and steps](#mesh-and-steps) shows the cost against the
+size of the mesh.
 """
     )
 
@@ -103,15 +103,15 @@ PARTS = ["factorise", "solve", "assemble", "residual", "rest"]
 
 
 CLAMP = """
-The long cylinder is as long as the finger: tilted towards the tip (`angled-0`), its other end meets
-the rim that the clamp holds, and its force is that of the rim, not of a pinch.
+The long cylinder is as long as the finger. Where it is tilted towards the tip (`angled-0`), its
+other end meets the rim that the clamp holds: the force is that of the rim, not of a pinch.
 
-Where the skin *snaps*, the force of a ball or a cylinder falls on the way in, and the trajectory
-ends before that step. It happens where 1.2 to 1.4 mm of the 1.57 mm of skin are squeezed away.
-Forces before it do not depend on the mesh (12.15 and 12.14 N at 3.35 mm under `sphere_medium`, with
-edges of 0.6 and 0.45 mm), but its place does (17 and 22.5 N), and a barrier five times as stiff
-moves it to 22 N: so it is of the elements, which are stretched to three times their length there,
-not of the finger.
+The skin *snaps* where the force falls while a ball or a cylinder moves in; the trajectory ends
+before that step. It happens where 1.2 to 1.4 mm of the 1.57 mm of skin are squeezed
+away. The force before the snap does not depend on the mesh: at 3.35 mm under `sphere_medium` it is
+12.15 N with edges of 0.6 mm and 12.14 N with 0.45 mm. The force at the snap does: 17 and 22.5 N. A
+volume barrier five times as stiff moves it to 22 N. So where the skin snaps is a property of the
+elements, which are stretched to three times their length there, and not of the finger.
 """
 
 PAPER_MM = {"normal": 3.0, "angled": 1.5}
@@ -174,19 +174,25 @@ def campaign() -> str:
     others_too = {}
     for mesh in ("0.47mm", "0.47mm-4-layers"):
         finer = {run["name"] for run in load(f"campaign-{mesh}") if not ended_well(run)}
-        others_too[mesh] = f"{len(runs) - len(finer)} do, and {len(finer & bad)} fail on both"
+        others_too[mesh] = f"{len(runs) - len(finer)} ({len(finer & bad)} fail on both meshes)"
     return (
         f"""
 ## Robustness
 
-The paper's {len(runs)} trajectories, as `palpate data generate runs/twin` simulates them (edges of
-0.6 mm, 0.60 ml of fluid, steps of 0.1 mm, friction), each 0.6 mm deeper than the paper's 3 mm along
-the normal and 1.5 mm at 30 degrees. **{len(good)} of {len(runs)} ({len(good) / len(runs):.1%})
-reach that depth or 32 N** (the goal is 98 %); {len(deep)} the paper's depth or 32 N. Deepest
-penetration of any converged step {max(run["penetration_um"] for run in runs):.2f} um. On a finer
-mesh (`--edge-mm 0.47`) {others_too["0.47mm"]}; with four layers, too (`--layers 4`),
-{others_too["0.47mm-4-layers"]}. (All, and the random paths, were run on cores of other machines,
-304 angled ones with four layers on a GPU; the picture is of an earlier run, in which 426 did.)
+The paper's {len(runs)} trajectories, as `palpate data generate runs/twin` simulates them: edges of
+0.6 mm, 0.60 ml of fluid, steps of 0.1 mm, friction. The paper presses 3 mm along the normal and
+1.5 mm at 30 degrees. Here the *full depth* is 0.6 mm more: **{len(good)} of {len(runs)}
+({len(good) / len(runs):.1%}) reach the full depth or 32 N** (the goal is 98 %), {len(deep)} reach
+the paper's depth or 32 N. The deepest penetration of any converged step is
+{max(run["penetration_um"] for run in runs):.2f} um.
+
+A finer mesh does not help. Full depth or 32 N is reached by {others_too["0.47mm"]} with edges of
+0.47 mm (`--edge-mm 0.47`), and by {others_too["0.47mm-4-layers"]} with four layers as well
+(`--layers 4`).
+
+These campaigns and the random paths ran on cores of other machines, 304 of the angled trajectories
+with four layers on a GPU. The picture is of an earlier run, in which 426 reached the full depth or
+32 N.
 
 ![All trajectories by indenter](../pictures/fem-campaign.png)
 
@@ -225,21 +231,27 @@ def stiffening() -> str:
 ## Skin that stiffens
 
 Why skin snaps below small indenters: [ADR 23](../adr/0023-mortar-contact.md#why-it-snaps). The same
-campaign with `palpate data generate FOLDER --strain-stiffening 0.004`, as constants published for
-a soft silicone have it: **{len(good)} of {len(whole)} ({len(good) / len(whole):.1%}) reach the full
-depth or 32 N** (the goal is 98 %). Angled presses end with forces that are
+campaign with `palpate data generate FOLDER --strain-stiffening 0.004`, a value that published
+constants of a soft silicone give: **{len(good)} of {len(whole)} ({len(good) / len(whole):.1%})
+reach the full depth or 32 N** (the goal is 98 %). The forces at the end of angled presses are
 {np.median(stiffer):.2%} larger in the median, {max(stiffer):.1%} at most.
 
-`{curves["command"]}`, the same with `{curves["other"]}`, and both with other skins:
+The picture shows two presses, each with three skins: `{curves["command"]}`, and the same with
+`{curves["other"]}`.
 
 ![{draw_stiffening(curves, DATA / "stiffening.png")}](fem/stiffening.png)
 
-The trajectories that neo-Hooke's skin does not bear (with 0.006 and 0.01 only those
-were run that it did not bear in an earlier campaign, so some are missing):
+The table is of the {len(snapped)} trajectories that end early with neo-Hooke's skin. With 0.006 and
+0.01 only those were run that had ended early in an earlier campaign, so some are missing:
 
 """
         + table(
-            ["strain stiffening", "bear it", "force at the end, median [N]", "iterations each"],
+            [
+                "strain stiffening",
+                "reach full depth or 32 N",
+                "force at the end, median [N]",
+                "iterations each",
+            ],
             rows,
         )
         + f"\nNot to full depth or 32 N, of all {len(whole)} with 0.004:\n\n"
@@ -314,24 +326,26 @@ def paths() -> str:
         f"""
 ## Random paths
 
-`palpate fem study paths --count {len(rows)} --edge-mm {1e3 * study["edge_m"]:g} --json`: a press
-of 0.5 to 2.5 mm, up to 30 degrees askew, then one to four of slide (to 2 mm), twist (to 40
-degrees), roll (to 20 degrees), further press and partial unloading, and out of the skin.
-**{len(whole)} of {len(rows)} ({len(whole) / len(rows):.1%}) complete** (the goal is 97 %). Friction
-is traction times slip times area, summed over increments; the tolerance of tractions may turn
-round 1e-4 of it in one. A whole path leaves the skin as it was, to {most:.4f} um; {near} of
-{len(whole)} to 0.01 um, the goal. What is left is the tolerance of contact's gaps, 1 nm; with one
-of 0.1 um the same paths left up to 0.1 um, and took 1 % fewer iterations. So the work of the
-indenter is that of friction: it is {gap:.2f} times as much in the median, as the mean of the wrench
-at both ends of an increment misses how it rises within.
+`palpate fem study paths --count {len(rows)} --edge-mm {1e3 * study["edge_m"]:g} --json`. A path is
+a press of 0.5 to 2.5 mm, up to 30 degrees from the normal, then one to four segments (slide to
+2 mm, twist to 40 degrees, roll to 20 degrees, press further, unload in part), and out of the skin.
+**{len(whole)} of {len(rows)} ({len(whole) / len(rows):.1%}) complete** (the goal is 97 %).
+
+* *Left*: the largest displacement of a node after a whole path, {most:.4f} um at most; {near} of
+  {len(whole)} meet the goal of 0.01 um. It comes from the tolerance of contact's gaps, 1 nm; with
+  0.1 um the same paths left up to 0.1 um, and took 1 % fewer iterations.
+* *Friction*: traction times slip times area, summed over increments. The solver's tolerance allows
+  that one increment gives back 1e-4 of a path's work.
+* The work of the indenter should be that of friction. It is {gap:.2f} times as much in the median,
+  because the mean of the wrench at both ends of an increment misses how it rises in between.
 
 """
         + table(
-            ["indenter", "complete", "friction [uJ]", "least of an increment [uJ]", "left [um]",
-             "mean seconds"],
+            ["indenter", "complete", "friction [uJ]", "least friction of an increment [uJ]",
+             "left [um]", "mean seconds"],
             cells,
         )
-        + "\nNot as they should be:\n\n"
+        + "\nNot complete, or friction gave work back:\n\n"
         + ("\n".join(others) or "* none")
         + "\n"
     )  # fmt: skip
@@ -343,9 +357,9 @@ def studies() -> str:
 ## Mesh and steps
 
 `palpate fem study mesh --png mesh.png --json` and `palpate fem study steps --json`: three
-indentations of 3 mm, and the ball of 7 mm 4 mm deep, where it pinches the skin on the core.
-Displacement is that of the whole outer skin. Accepted is a change of 2 % of the force and of
-0.02 mm in the mean by the last refinement.
+indentations of 3 mm, and the *pinch*, a ball of 7 mm pressed 4 mm deep, which pinches the skin on
+the core. A change is from one refinement to the next; that of displacement is over the whole outer
+skin. Accepted is a last change of 2 % of the force and 0.02 mm of the mean displacement.
 
 ![What refinement changes](../pictures/fem-mesh-study.png)
 
@@ -391,8 +405,8 @@ def half_the_size() -> str:
     told = ", ".join(f"{press} {value:.1%}" for press, value in apart.items())
     unknowns = next(row["unknowns"] for row in rows if row["edge_m"] == edge)
     return (
-        f"Forces on the mesh of {1e3 * edge:g} mm, which has {unknowns:,} unknowns, against those "
-        f"on one of half the size: {told} (goal: 2 %, in the pinch too).\n"
+        f"Difference of the force on edges of {1e3 * edge:g} mm ({unknowns:,} unknowns) from that "
+        f"on edges of half the length: {told} (goal: 2 %, in the pinch too).\n"
     )
 
 
@@ -411,9 +425,9 @@ def recovery() -> str:
 ## Calibration recovers known parameters
 
 `palpate fem recover --json` (and `--edge-mm 0.9 --seed N`): five indentations are
-simulated with thickness 1.45 mm, modulus 330 kPa and friction 0.25, noise is added to each axis of
-the force, and the calibration starts from its scan. The simulator explains its own forces here:
-this tests search and data processing, not the model.
+simulated with thickness 1.45 mm, modulus 330 kPa and friction 0.25, and noise is added to each axis
+of the force. The calibration starts from its scan; the table has its errors. The same simulator
+makes the forces and fits them, so this tests search and data processing, not the model.
 
 """ + table(
         ["mesh", "noise [N]", "seed", "thickness [%]", "modulus [%]", "friction [%]", "volume [%]",

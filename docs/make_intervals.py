@@ -496,9 +496,10 @@ def page(facts: dict[str, Any]) -> str:
     parts = [
         HEAD,
         markdown_table(BOUND_HEAD, bound_rows(simulated)),
-        "\n*Off the goal by*: points beyond 90 ± 3 %. *Bound*, *error*: medians over rows.\n"
-        "Where bounds were learned on other specimens, specimens are counted, not presses.\n",
-        "## By true force\n\nHow often it holds (presses), and the median bound.\n",
+        "\n*Off the goal by*: percentage points outside of 90 ± 3 %. *Bound*, *error*: medians over"
+        " rows.\nWhere bounds were learned on ten other specimens, *presses* counts specimens.\n",
+        "## By true force\n\nEach cell: how often the bound holds (number of presses), and the"
+        " median bound.\n",
         markdown_table(BIN_HEAD, bin_rows(simulated)),
         "\n## Real fingers\n",
         REAL,
@@ -506,8 +507,8 @@ def page(facts: dict[str, Any]) -> str:
     if real:
         parts += [
             markdown_table(BOUND_HEAD, bound_rows(real)),
-            "\nThe method for fingers that training has not met ([transfer](transfer.md)) has"
-            " intervals of the magnitude of its own:\n",
+            "\nThe method for fingers that training has not met ([transfer](transfer.md)) makes its"
+            " own intervals of the magnitude:\n",
             markdown_table(
                 ["finger", "labelled presses", "holds", "half width"],
                 [
@@ -528,8 +529,9 @@ def page(facts: dict[str, Any]) -> str:
                     for one in facts["real_flags"]
                 ],
             ),
-            "\nThe pattern's two settings, chosen on one finger and tested on the other, fitted to"
-            " `calibrate` alone, false flags on `check`:\n",
+            "\nThe check of the range has two settings. Here they are chosen on one real finger and"
+            " tested on the other; the range is learned from `calibrate` alone, false flags are of"
+            " `check`:\n",
             markdown_table(
                 ["chosen on", "scale [counts]", "shrinkage", "tested on", "flagged", "false flags"],
                 [
@@ -546,13 +548,13 @@ FLAG_HEAD = ["bundle", "presses", "number", "falsely flagged", "95 % interval"]
 
 HEAD = """# How often the bounds of estimates hold
 
-Written by `python docs/make_intervals.py runs ../shared/data`; numbers in
-[intervals.json](intervals.json). What a bound is: [ADR 0031](../adr/0031-intervals.md). Goal: a
-bound of 90 % holds in 90 ± 3 % of the rows, each press counting the same.
+A *bound* says how far an estimate may be off ([ADR 0031](../adr/0031-intervals.md)). Goal: a bound
+of 90 % holds in 90 ± 3 % of the rows, each press counting the same. Written by
+`python docs/make_intervals.py runs ../shared/data`; numbers in [intervals.json](intervals.json).
 
 ![How often bounds hold, by true force](intervals.png)
 
-The presses are made by
+These commands make the presses:
 
 <!-- run by: tests/deploy/test_generate.py [palpate data generate],
      tests/training/fields/test_more_presses.py [palpate data shrink],
@@ -572,19 +574,25 @@ mkdir runs/drawn && cp -r runs/test/mechanics.sim runs/drawn/      # the mechani
 palpate data generate runs/drawn --points 2 --angled 2 --seed 13 --units drawn.json
 ```
 
-The shipped bundles are calibrated with `calibrate`, `check` and both `scattered` (2,000 presses at
-random: 270 s on one H200, hours on two cores), which no training has seen; all
-below is of `test` and `random-500`, whose points neither training nor calibration has seen, and of
-the sample that ships. Hard presses need many: above 8 N the bounds of the force held in 58 % of
-presses at random without `scattered`, in 78 % with 300 such presses, in 85 % with 1,000.
+* The bounds of the shipped bundles were learned from `calibrate`, `check` and both `scattered`
+  (2,000 presses at random: 270 s on one H200, hours on two cores). No training has seen these.
+* They are tested here on `test` and `random-500`, whose points neither training nor calibration has
+  seen, and on the sample that ships.
+* Bounds of hard presses need many presses: above 8 N the bounds of the force held in 58 % of
+  presses at random without `scattered`, in 78 % with 300 such presses, in 85 % with 1,000.
+
+*force_magnitude* bounds the error of the length of the force, *force* the length of the error's
+vector. *Specimens never met* are simulated fingers that neither training nor calibration has seen.
 """
 
-REAL = """Where a bundle was not made for a sensor, it gives the bounds that real fingers needed.
-Two fingers prove nothing for a third: what holds of one on the other shows it.
+REAL = """For a sensor that a bundle was not made for, it gives the bounds that real fingers needed.
+Two real fingers prove nothing for a third; the table shows how often the bounds of one hold on the
+other. *Bounds that ship* know both fingers; *as if it were the twin's* takes the bounds for fingers
+that the bundle was made for.
 """
 
-FLAGS = """`OUT_OF_RANGE` on presses that neither training nor calibration has seen; goal: at most
-1 %.
+FLAGS = """Rows of simulated presses, which neither training nor calibration has seen, that are
+flagged `OUT_OF_RANGE`. The goal is at most 1 %.
 """
 
 

@@ -19,10 +19,9 @@ HEAD = """\
 <!-- Written by docs/make_models.py from the bundles that ship; do not edit. -->
 # Models that ship
 
-Their cards, as `palpate model card` shows them for any bundle. What each costs per frame:
-[results/networks.md](results/networks.md). How they are trained again: [twin.md](twin.md).
 They were trained on simulated fingers alone: on a real sensor their numbers mean nothing until you
-train your own.
+train your own. Each section is the card that `palpate model card` shows. What each model costs per
+frame: [results/networks.md](results/networks.md). How they are trained: [twin.md](twin.md).
 """
 
 

@@ -361,10 +361,10 @@ def last_cell(report: dict[str, Any]) -> dict[str, Any]:
 
 HEAD = """# A population of simulated BioTacs
 
-Made by `python docs/make_population.py`, whose head names the commands before it. All of it is
-simulated: fingertips, each with a skin, fill and friction of its own, indented by finite elements;
-specimens on them, which differ in their electrodes, fluid, core's place, noise and warmth
-([priors](twin/units.md), `palpate_fem.population.fingertips`).
+Made by `python docs/make_population.py`; its docstring names the commands before it. Everything
+here is simulated. A *fingertip* has a skin, fill and friction of its own and is indented by finite
+elements. Each fingertip has several *specimens*, which differ in electrodes, fluid, place of the
+core, noise and warmth ([priors](twin/units.md), `palpate_fem.population.fingertips`).
 
 ## The set
 """
@@ -372,69 +372,78 @@ specimens on them, which differ in their electrodes, fluid, core's place, noise 
 SECOND_SET = """## A second set, and bounds
 
 {presses:,} more presses ({all:,} rows) on {fingertips} other fingertips with {specimens} other
-specimens, a plate among the indenters ([LOG](../../training/LOG.md)); content of the features file:
-sha256 {sha}.
-The same network, learned from {train:,} of these rows (seed {seed}, {epochs} passes), ships, and is
-[one of the estimators](../adr/0025-calibrated-fingers.md) of `palpate calibrate`;
-{count} specimens of fingertips that were not met, the same {rows:,} rows for any number of presses:
+specimens; a plate is among the indenters ([LOG](../../training/LOG.md)). Content of the features
+file: sha256 {sha}.
+The same network, learned from {train:,} of these rows (seed {seed}, {epochs} passes), ships. It is
+[one of the estimators](../adr/0025-calibrated-fingers.md) of `palpate calibrate`. Its errors on
+{count} specimens of fingertips not met, on the same {rows:,} rows for any number of known presses:
 """
 
-BOUNDS = """Bounds of 90 %, learned on presses of one half of these fingertips, tested on the other
-half, and the other way round: so neither network nor bound has met specimen or skin (goal: a bound
-holds in 90 ± 3 %, each specimen and each of its presses counting the same):
+BOUNDS = """Bounds of 90 %, learned on presses of one half of these fingertips and tested on the
+other half, then the other way round. So neither the network nor the bound has met specimen or skin.
+Goal: a bound holds in 90 ± 3 %, where each specimen counts the same, and so does each of its
+presses:
 """
 
 NETWORK = """## One network for all specimens
 
-`palpate train population` ({all:,} rows of {presses:,} presses, {train:,} of them learned from;
-content of the features file: sha256 {sha}). It reads the change of the logarithm of each impedance
-since rest, and is told the specimen by presses of it, if some are known (FiLM). Of {fingertips}
-fingertips three, with all their specimens and presses, are in no training (*fingertip not met*), of
-the others 15 % of the specimens (*specimen not met*, presses met) and a tenth of the presses
-(*press not met*): {unseen} of {specimens} specimens in all. Rows of at least 0.5 N. Trained on one
-H200, 50 to 60 passes in 1 to 2 minutes.
+`palpate train population` ({all:,} rows of {presses:,} presses, of which {train:,} rows are learned
+from; content of the features file: sha256 {sha}). The inputs are the change of the logarithm of
+each impedance since rest and, if some presses of the specimen are known, these presses (by FiLM).
+Not in the training are:
 
-Without a known press; means over {seeds} seeds, and the range of them. Each seed has other
-fingertips that are not met; settings were chosen on those of seed 0. The last three columns are of
-these fingertips: the network when all electrodes are off by 0.05 of a logarithm, as a fluid that
-has warmed since the tare (the worse of both signs), and rivals on the same inputs.
+* *fingertip not met*: three of the {fingertips} fingertips, with all their specimens and presses;
+* *specimen not met*: 15 % of the specimens of the other fingertips (their presses are met, on other
+  specimens). With the former, {unseen} of {specimens} specimens are not met;
+* *press not met*: a tenth of the presses on the other fingertips.
+
+Rows have at least 0.5 N. The network was trained on one H200, 50 to 60 passes in 1 to 2 minutes.
+
+The first table is without a known press: means over {seeds} seeds, and their range in brackets.
+Each seed leaves out other fingertips; settings were chosen on those of seed 0. The last three
+columns are of the fingertips not met: the network when all electrodes are off by 0.05 of a
+logarithm, as by a fluid that has warmed since the tare (the worse of both signs), and two rivals on
+the same inputs.
 """
 
-SHOTS = """Where some presses of the finger are known: {specimens} specimens of fingertips that were
-not met, {draws} draws of presses of each, tested on presses at other points, none of them in the
-training; the same {rows:,} rows for any number of presses. Beside them specimens that were met, by
-presses that were not. *Ratio*: of the one to the other, both with ten presses (goal 1.2). *One
-factor*: what the network estimates without a press, times the factor that fits the known presses.
+SHOTS = """The second table is with known presses of the finger. *Not met* and the number of known
+presses: {specimens} specimens of fingertips not met, {draws} draws of known presses of each, tested
+on presses at other points, none of them in the training; the same {rows:,} rows for any number of
+presses. *Finger met*: specimens that were met, tested on presses that were not. *Ratio*: error on
+fingers not met over that on fingers met, both with ten presses (goal 1.2). *One factor*: the
+network's estimate without a press, times the one factor that fits the known presses best.
 """
 
 TOLD = """## What it says
 
-* **Ten presses tell a finger that was never met** as well as one that was: {force_10:.3f} and
-  {met:.3f} N, {ratio:.2f} times as much (goal 1.2). Without one, forces are too small or too large
-  by one factor: {force_0:.2f} N; with one press {force_1:.2f} N, with five {force_5:.2f} N. One
-  factor fitted to the ten presses reaches {factor:.2f} N. Centre and normal have a ratio of
-  {ratio_centre:.2f} and {ratio_normal:.2f}; on the second set all quantities have {ratio_second}.
-* **The electrodes at rest are not read.** They name a specimen of the training, which is then known
-  by heart; presses count for nothing, and a finger that was not met is estimated twice as badly
-  ([LOG](../../training/LOG.md)).
-* **A skin that was not met costs nothing beside a specimen that was not**: {specimen:.2f} N without
-  a press, and {specimen_10:.2f} N with ten.
-* **Where it is touched needs no press**: centre of pressure {centre:.2f} mm and contact normal
-  {normal:.1f} degrees, of {centre_constant:.0f} mm and {normal_constant:.0f} degrees for a
-  constant. Presses bring the location from {location_0:.2f} to {location_10:.2f} mm (goal 0.8).
-* **From 2 N on the force is bad**: {hard:.0f} % of it, {hard_met:.0f} % on specimens that were met
-  (goal 8). Off the pad the skin is pinched on the core, and forces grow while electrodes hardly
-  change. Wider networks and more passes know more presses by heart, and others worse; half as many
-  presses again bring 31 to 29 % (LOG).
-* **Bounds hold on specimens and skins that were not met** once a press is known: {held_1:.0f} % of
-  the forces and {held_location:.0f} % of the locations, of 90. Without one a force's bound holds in
-  {held_0:.0f} %, as whole specimens are off by one factor.
-* **A common offset does no harm**: with 0.05 of a logarithm on all electrodes ten presses leave
-  {offset:.2f} N.
-* **On real fingers it does not help** the method for [fingers never met](transfer.md): a quarter of
-  its magnitude makes both fingers worse (LOG). What touched them is not known; a plate explains
-  them as well as any ([fit to a sensor](twin/sensor-fit.md)), but the second set, which has one,
-  brings them no nearer.\
+* **Ten presses make a finger that was never met as good as one that was**: {force_10:.3f} and
+  {met:.3f} N, a ratio of {ratio:.2f} (goal 1.2). With no press the error is {force_0:.2f} N, as all
+  forces of a finger are too small or too large by one factor; with one press it is {force_1:.2f} N,
+  with five {force_5:.2f} N. One factor fitted to the ten presses leaves {factor:.2f} N. Centre and
+  normal have ratios of {ratio_centre:.2f} and {ratio_normal:.2f}; on the second set all ratios are
+  {ratio_second}.
+* **The network does not read the electrodes at rest.** They would identify a specimen of the
+  training, which the network then knows by heart: known presses no longer help, and a finger that
+  was not met is estimated twice as badly ([LOG](../../training/LOG.md)).
+* **A new skin is no worse than a new specimen on a known skin**: on specimens not met the force is
+  off by {specimen:.2f} N without a press and by {specimen_10:.2f} N with ten.
+* **The place of the contact hardly needs a press**: with ten presses, centre of pressure
+  {centre:.2f} mm and contact normal {normal:.1f} degrees (a constant: {centre_constant:.0f} mm and
+  {normal_constant:.0f} degrees). Ten presses bring the location from {location_0:.2f} to
+  {location_10:.2f} mm (goal 0.8).
+* **From 2 N on the force is bad**: off by {hard:.0f} % with ten presses, by {hard_met:.0f} % on
+  specimens that were met (goal 8). Beside the pad the skin is pinched on the core, and forces grow
+  while electrodes hardly change. Wider networks and more passes learn more presses by heart, and
+  get worse on others; with half as many presses again 31 % become 29 % (LOG).
+* **Bounds hold on specimens and skins that were not met**, once a press is known: for {held_1:.0f}
+  % of the forces and {held_location:.0f} % of the locations (nominal 90). Without a press the bound
+  of force holds in {held_0:.0f} %, because whole specimens are off by one factor.
+* **A common offset does no harm**: with 0.05 of a logarithm on all electrodes, the force is off by
+  {offset:.2f} N with ten presses.
+* **On real fingers the network does not help** the method for [fingers never met](transfer.md): a
+  quarter of its magnitude makes both fingers worse (LOG). What touched these fingers is not known.
+  A plate explains them as well as any indenter ([fit to a sensor](twin/sensor-fit.md)), but the
+  second set, which has one, comes no nearer to them.\
 """
 
 

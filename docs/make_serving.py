@@ -20,10 +20,9 @@ PAGE = FOLDER.with_suffix(".md")
 
 HEAD = """# Serving: latency, load, faults, exchange of models, a long run
 
-Each table is made from the file of one command, which stands above it; `make serving` runs all of
-them, and `python docs/make_serving.py` writes this page. The goals are those of the serving
-reference. Hostile files have [a page of their own](hostile-files.md), as have
-[faults of devices](faults.md).
+Each table shows the output of the command above it. `make serving` runs all commands, and
+`python docs/make_serving.py` writes this page. The goals are those of the serving reference.
+Hostile files have [a page of their own](hostile-files.md), as have [faults of devices](faults.md).
 """
 
 
@@ -72,13 +71,17 @@ def _latency() -> str:
                 "",
             )
         )
-    text = _table(
+    text = (
+        "The *floor* is the same path without palpate's code. Both run in turns of a few seconds, "
+        "so that they meet the same disturbances of the host.\n\n"
+    )
+    text += _table(
         "frame stamp to estimate in the client | p50 | p99 | max | lost in all runs", rows
     )
     stages = ", ".join(
         f"{name.replace('_', ' ')} {_ms(value)}" for name, value in values["e2e.stages_s"].items()
     )
-    text += f"\nThe stages of palpate's estimates, as the service notes them, medians: {stages}.\n"
+    text += f"\nMedian time of each stage, as the service notes it: {stages}.\n"
     text += "\n" + _table(
         "load | frames | lost | p50 | p99",
         (
@@ -103,7 +106,7 @@ def _restarts() -> str:
     goals = {"kill": 3.0, "hang": 10.0, "end": 2.0}
     rows = []
     for trials in (*values["restart"], *more["restart"]):
-        # A process that is told to end is to be gone; others are to publish again.
+        # For a process that is told to end: until the next one is there. Others publish again.
         times = trials["process_s" if trials["fault"] == "end" else "publishing_s"]
         tried = len(times) + trials["failed"]
         rows.append(
@@ -118,7 +121,13 @@ def _restarts() -> str:
                 _yes(trials["met"]),
             )
         )
-    text = _table("process | fault | back | p50 | max | goal | floor | met", rows)
+    text = (
+        "Times are until the process publishes again; for *end* (SIGTERM) until the next process "
+        "is there. *Floor*: a bare program that a bare supervisord restarts, and the imports of "
+        "the foreign packages (not for *end*), and for *hang* the time that may pass without a "
+        "heartbeat.\n\n"
+    )
+    text += _table("process | fault | back | p50 | max | goal | floor | met", rows)
     return _section(
         "Killed and hung processes until they publish again",
         "palpate bench restart --times 20`, and with `--only fem --only metrics",
@@ -132,8 +141,8 @@ def _status() -> str:
     result = values["status"]
     text = (
         f"{result['complete']} of {result['calls']} answers of `palpate status` were complete "
-        f"({result['processes']} processes; {result['burners']} loops loaded the cores). A call "
-        f"took {result['p50_s']:.2f} s in the median, {result['max_s']:.2f} s at most.\n"
+        f"({result['processes']} processes; {result['burners']} busy loops loaded the cores). A "
+        f"call took {result['p50_s']:.2f} s in the median, {result['max_s']:.2f} s at most.\n"
     )
     return _section("Status under load", "palpate bench status --count 200", values, text)
 
@@ -152,12 +161,14 @@ def _swaps() -> str:
         for name in ("undisturbed", "changing")
         for account in [values[f"swap.{name}"]]
     ]
-    text = _table("part | frames | lost | repeated | mixed | longest gap", rows)
+    text = "*Mixed*: estimates whose bytes are those of no single bundle.\n\n" + _table(
+        "part | frames | lost | repeated | mixed | longest gap", rows
+    )
     loads, backs = values["swap.load_s"], values["swap.roll_back_s"]
     text += (
         f"\n{values['swap.changes']} changes: a load took {_ms(loads['p50'])} in the median and "
-        f"{_ms(loads['max'])} at most, a roll back {_ms(backs['p50'])} and "
-        f"{_ms(backs['max'])} (goal 100 ms).\n"
+        f"{_ms(loads['max'])} at most, a roll back {_ms(backs['p50'])} in the median and "
+        f"{_ms(backs['max'])} at most (its goal is 100 ms).\n"
     )
     return _section("Exchange of models at 100 Hz", "palpate bench swap", values, text)
 
@@ -204,9 +215,10 @@ def _soak() -> str:
     lost = sum(result["lost"].values())
     text += (
         f"\n{result['minutes']:.0f} minutes, {result['fingers']} fingers, "
-        f"{sum(result['received'].values()):,} messages received, {lost} lost. Records and views: "
-        f"{result['disk_mb_per_h']:.0f} MB an hour, {result['disk_peak_mb']:.0f} MB at most of "
-        f"{result['disk_limit_mb']:.0f} MB allowed, {result['removed_records']} records removed.\n"
+        f"{sum(result['received'].values()):,} messages received, {lost} lost. Records and views "
+        f"grew by {result['disk_mb_per_h']:.0f} MB an hour. They took {result['disk_peak_mb']:.0f} "
+        f"MB at most, {result['disk_limit_mb']:.0f} MB are allowed; {result['removed_records']} "
+        "records were removed.\n"
         "\n![Memory of each process](serving/soak.png)\n"
     )
     return _section("A long run of the whole station", "palpate bench soak", values, text)

@@ -31,20 +31,22 @@ HEAD = """\
 <!-- Written by docs/make_study.py from the JSON of docs/results/study; do not edit. -->
 # All systems in one harness: what came out
 
-Tables, pictures and the numbers behind them; each page names the command that made its folder:
+The pages below have tables, pictures and the numbers behind them. Each names its command:
 
 {pages}
-Tests of all units in a task's first split have five seeds, the others one.{missing} What each
-network costs per frame: [networks.md](networks.md). What failed:
+A test of all units in the first split of a task has five seeds, any other test one.{missing} What
+each network costs per frame: [networks.md](networks.md). What failed:
 [training/LOG.md](../../training/LOG.md). How it is built: [ADR 22](../adr/0022-one-study.md).
 
 ## Goals
 
-Ours are means of three networks; *with gains* are the same, trained with random gains of the
-electrodes, which stand for fingers that were not seen. The floor is the same network (without
-gains) tested on rows whose neighbours it was trained on: it is no result, and shows what more
-presses could give. A ratio is our median error over that of the best of the paper's three networks
-in the same test, with its 95 % interval.
+* *Ours*: the mean of three networks.
+* *With gains*: the same, trained with random gains of the electrodes, which stand for fingers that
+  were not seen.
+* *Floor*: the same network without gains, tested on rows whose neighbours it was trained on. It is
+  no result; it shows what more presses could give.
+* *Ratio*: our median error over that of the best of the paper's three networks in the same test,
+  with its 95 % interval.
 
 """
 
@@ -52,7 +54,7 @@ PAGES = (
     (
         "[twin](study/twin/report.md)",
         "the twin: 450 indentations, three simulated BioTacs",
-        "trajectories, executions, points, indenters; a BioTac, nothing calibrated; "
+        "trajectories, executions, points, indenters; a BioTac (without calibration); "
         "neighbouring rows (no result: the floor)",
     ),
     (
@@ -62,7 +64,7 @@ PAGES = (
     ),
     (
         "[few](study/few/report.md), [more](study/more/report.md)",
-        "the twin without and with ten thousand other presses",
+        "the twin, without and with ten thousand other presses",
         "trajectories",
     ),
 )
@@ -70,48 +72,47 @@ PAGES = (
 MORE = """
 ## With {times} times the presses
 
-The same twin was pressed at other points and at random, {others:,} trajectories more
-([how](../twin.md)), joined with the paper's experiment (`palpate data join`), and learned from
-beside its training trajectories: `palpate train report --test-part`. Tested is the same fifth of
-the paper's trajectories both times: [few](study/few/report.md) learns from {own} others of them
-alone (five seeds), [more](study/more/report.md) from all (one seed). *Paper's* is the best of its
-networks in that test, given the same presses.
+The same twin was pressed {others:,} times more, at other points and at random ([how](../twin.md)).
+These trajectories were joined with the paper's experiment (`palpate data join`) and added to its
+training trajectories: `palpate train report --test-part`. Both columns are tested on the same fifth
+of the paper's trajectories. [Few](study/few/report.md) learns from {own} others of the paper's
+trajectories (five seeds), [more](study/more/report.md) also from the {others:,} (one seed).
+*Paper's*: the best of the paper's networks in that test, given the same presses.
 
 {table}
-* **Presses are what errors fall by**: {reached} of {goals} goals are reached, by the networks as
-  they were, with no setting changed.
-* **The network matters less where there are enough of them.** For the force from 2 N the paper's
-  PointNet++ is as good as ours (ratio {ratio}), for electrodes nearly so; for angle, location and
-  skin ours stay ahead. The goals for ratios, set where presses are few, are not reached.
+* **More presses make the errors smaller**: with them the same networks, with no setting changed,
+  reach {reached} of {goals} goals.
+* **With enough presses the network matters less.** For the force from 2 N the paper's PointNet++ is
+  as good as ours (ratio {ratio}), for electrodes nearly so; for angle, location and skin ours stay
+  ahead. The goals for ratios, which were set for few presses, are not reached.
 """
 
 TAIL = """
-## What holds back what is not reached
+## Why some goals are not reached
 
-**Presses**, for whatever depends on the twin. Every error falls with the trajectories that our
-networks are trained on, and none levels off ([picture](study/presses.png),
-`python docs/make_learning_curve.py`). The floors are below nearly all goals, so noise, labels and
-networks would allow them. The last column is what the slope of the last doubling would ask for;
-slopes become flatter, though: the force was {force_more} off with the presses above. {hard} of the
-rows are above 8 N.
+**Too few presses**, for all tests on the twin. Every error falls with the number of trajectories
+that our networks are trained on, and none levels off ([picture](study/presses.png),
+`python docs/make_learning_curve.py`). The floors are below nearly all goals, so neither noise nor
+labels nor networks prevent them. *Presses needed* extrapolates the slope of the last doubling; in
+fact slopes become flatter: with the presses of the section above, the force was {force_more} off.
+{hard} of the rows are above 8 N.
 
 {curve}
-* **The ratios.** Presses limit the paper's networks, too. On neighbouring rows our error is
-  {floor_force} of the best one's for force from 2 N, {floor_angle} for its angle and
-  {floor_location} for location below 2 N, which would meet the goals; but that is not so with more
-  presses, above.
-* **A BioTac that was not seen.** Random gains in training stand for it: over all {tests} tests the
-  mean error falls from {plain_force} to {gains_force} of force and from {plain_location} to
-  {gains_location} of location. Attention over electrodes without gains has {attention_force} and
-  {attention_location}.
-* **A real finger that was seen: baselines.** Gains do harm there. Without them our networks are as
-  good as the paper's best on unseen blocks (ratios {block1} and {block2}), so the network is not
-  what matters: electrodes wander between touches, and there are a few minutes of data.
-* **Electrodes from the skin** have the steepest way to go: where the film closes, its thickness
-  follows the pressure on the core, of which a displacement says little
+* **The ratios.** Few presses limit the paper's networks, too. On neighbouring rows the ratio is
+  {floor_force} for force from 2 N, {floor_angle} for its angle and {floor_location} for location
+  below 2 N, which would meet the goals; with more presses (section above) it is not met.
+* **A BioTac that was not seen.** Random gains in training stand for it. Over all {tests} tests they
+  lower the mean error of force from {plain_force} to {gains_force}, and of location from
+  {plain_location} to {gains_location}. Attention over electrodes, without gains, has
+  {attention_force} and {attention_location}.
+* **A real finger that was seen: its baselines.** Gains do harm there. Without them our networks are
+  as good as the paper's best on unseen blocks (ratios {block1} and {block2}). So the network is not
+  what matters: electrodes drift between touches, and there are only a few minutes of data.
+* **Electrodes from the skin** are farthest from their goal: where the fluid film closes, its
+  thickness follows the pressure on the core, of which a displacement says little
   ([training/LOG.md](../../training/LOG.md)).
-* **Location below 2 N** carries the robot's registration error, one constant for each unit and arm,
-  which can only be learned on seen units.
+* **Location below 2 N** includes the robot's registration error, one constant for each unit and
+  arm, which can only be learned on units that were seen.
 """
 
 

@@ -162,54 +162,59 @@ def page(facts: dict[str, Any]) -> str:
     ended += [[rival, *(cell(one[rival]) for one in facts["later"])] for rival in RIVALS]
     return f"""# Force on a real finger that training has not met
 
-Made by `python docs/make_transfer.py ../shared/data`; one row of it by `palpate data ingest-lasa
-force_calibration.npz 1.h5 --finger 1`, the same for 2, and `palpate train transfer --train 1.h5
---test 2.h5 --shots 5`. Two real BioTacs of the LASA force calibration, always in contact, forces
-of 0.4 to 10 N; each is estimated by what was learned on the other.
+Two real BioTacs of the LASA force calibration, always in contact, forces of 0.4 to 10 N. The force
+of each is estimated by what was learned on the other. `python docs/make_transfer.py ../shared/data`
+makes this page. To make one row, use `palpate data ingest-lasa force_calibration.npz 1.h5
+--finger 1`, the same for 2, and `palpate train transfer --train 1.h5 --test 2.h5 --shots 5`.
 
 ![Error against labelled presses](transfer.png)
 
-Median error of the magnitude [N] / 95 % of the errors are below [N] / median angle [rad]:
+Each cell has three figures: median error of the magnitude [N] / the error that 95 % of the rows
+stay below [N] / median error of the angle [rad].
 
 {markdown_table(head, ways)}
-*Tare only*: a row's estimate follows from the tare and the rows before it. *Unlabelled*: mean and
-spread of the electrodes over the whole recording may be used, but no force. *Presses*: so many
-pieces of 2 s with known forces, drawn at random {facts["draws"]} times; rows within 1 s of them are
-not tested; electrodes without forces are used, too. The constant is the mean force of the other
-finger, then of the labelled rows; the ridge regression on tared counts knows the same rows.
+* *Tare only*: the estimate of a row uses the tare and the rows before it.
+* *Unlabelled*: it may also use mean and spread of the electrodes over the whole recording, but no
+  force.
+* *Presses*: it may also use so many pieces of 2 s with known forces, drawn at random
+  {facts["draws"]} times. Rows within 1 s of them are not tested.
+* *Constant*: the mean force of the other finger; with presses, that of the labelled rows.
+* *Ridge*: a ridge regression on tared counts, which learns from the same rows.
 
-The same with a tare only, on electrodes that were changed: logarithm of the impedance over that at
-rest, of all electrodes or of each.
+With a tare only, on electrodes that were changed: the change is of the logarithm of the impedance
+over that at rest, of all electrodes alike or of each.
 
 {markdown_table(["", *head[1:], *(f"ridge, {name}" for name in names)], stressed)}
-A finger from the first seconds of its own recording, as `palpate calibrate` learns (no other
-finger, no state between frames: what a bundle can hold), tested on all that comes later:
+A finger that is learned from the first seconds of its own recording, as by `palpate calibrate`, and
+tested on all that comes later. It uses no other finger, and no state between frames, which a bundle
+cannot hold:
 
 {markdown_table(["", *names], calibrated)}
-A finger that was met, later: learned from the first {100 * LEARNED:.0f} % of both recordings at
-once, tested on the rest of each, with nothing chosen anew (goals 0.12 and 0.16 N, 0.045 rad; the
-networks of the [study](study.md) have 0.085 and 0.33 N):
+Fingers that training has met, at a later time: learned from the first
+{100 * LEARNED:.0f} % of both recordings at once, tested on the rest of each, no setting changed
+(goals 0.12 and 0.16 N, 0.045 rad; the networks of the [study](study.md) have 0.085 and 0.33 N):
 
 {markdown_table(["", *names], ended)}
 {on_simulated_fingers()}
 * How it works: `palpate_training/systems/transfer.py`, and `tasks/finger.py` for its own presses.
   What was tried: training/LOG.md.
-* *Without the twin's line*: the magnitude starts from a line through 20,000 presses of the
-  [twin](population.md), 60 numbers, whose scale and axes the other finger tells. It helps where
-  little is known; no network of the twin did. `palpate calibrate` starts from it, too.
-* A press corrects most what lies within some ten seconds before and after it, as baselines wander;
-  an estimate that is made at once has only the presses before it, so it gains less.
-* Its own first minute alone is worse than five presses drawn from the whole recording, beside the
-  other finger: within a recording baselines wander, and these fingers are never let go to tare.
-* Its constants were chosen on these two fingers, the worse counting, so the numbers are somewhat
-  flattered; a third finger would be a test.
-* A single press makes the magnitude of the first finger worse. From two presses on a ridge
-  regression, corrected in the same way, has its share, as large as presses that are left out say:
-  magnitudes gain by it, the first finger's direction with five presses does not (0.071 rad
-  without).
+* The *twin's line*: the magnitude starts from a linear fit of 20,000 presses of the
+  [twin](population.md), 60 numbers; scale and axes of the fit are taken from the other finger. It
+  helps where little is known; no network of the twin did. `palpate calibrate` starts from it, too.
+* A labelled press corrects most the rows within some ten seconds before and after it, because
+  baselines wander. An estimate in real time has only the presses before it, so it gains less.
+* A finger's own first minute alone is worse than the other finger and five presses drawn from the
+  whole recording: baselines wander, and these fingers are never released to be tared again.
+* The constants of the method were chosen on these two fingers, by the worse of the two. So the
+  numbers are somewhat too good; a third finger would be a test.
+* A single press makes the magnitude of the first finger worse. From two presses on, a ridge
+  regression that is corrected in the same way is mixed in; presses that are left out decide its
+  share. Magnitudes gain by it; the first finger's direction with five presses does not (0.071 rad
+  without it).
 * The errors that are left are mostly slow: baselines that wander within half a minute.
-* The intervals come from the other finger's halves, which differ less than fingers do, and the more
-  from the labelled presses, each estimated without itself, the more there are.
+* The intervals are learned from errors between the halves of the other finger's recording, which
+  are smaller than those between fingers. The more labelled presses there are, the more the
+  intervals rest on these, each estimated without itself.
 """
 
 
@@ -242,24 +247,29 @@ def on_simulated_fingers() -> str:
                 ]
             )  # fmt: skip
     head = ["pairs", "presses", "number", "magnitude [N]: median, worst", "ridge", "constant",
-            "no worse than ridge", "than the constant", "angle [rad], ridge, constant",
+            "no worse than ridge", "no worse than constant", "angle [rad], ridge, constant",
             "90 % intervals hold"]  # fmt: skip
     return f"""## Simulated fingers
 
-The constants were chosen on these two fingers. So the method was tried between {report["fingers"]}
-simulated ones ([commands](../make_transfer_simulated.py)), each with a skin, fill and electrodes of
-its own, pressed {report["presses"]} times and drifting as real ones do: each tested after each
-other one alone was learned from. *Unlike*: untouched, the impedance of one is more than twice that
-of the other. Then, without a press, the estimate is the other's mean force, as nothing tells how
-sensitive the finger is. Of the others the size of their signals tells it: beyond {SAME_USE:g} times
-those of the other finger they are scaled down, from {SAME_USE**2:g} times on to the same size. That
-could be wrong, as a finger may be pressed harder than the other was: of those *pressed harder* only
-the harder half of the presses is in the recording. With presses, leaving each out in its turn
-tells whether the scale of the estimates is wrong, too, and how much to believe a line: a ridge
-regression on logarithms of impedances that knows the same presses, corrected by them in the same
-way. All that was found on these fingers, and on the real ones (training/LOG.md), where signals
-differ by 1.4 and nothing is scaled; with the {report["new_fingers"]} *new* fingers nothing was
-chosen.
+The constants were chosen on the two real fingers. So the method was also tested on pairs of
+simulated fingers ([commands](../make_transfer_simulated.py)): it learns from one finger and is
+tested on the other. {report["fingers"]} fingers have a skin, fill and electrodes of their own, are
+pressed {report["presses"]} times, and drift as real ones do.
+
+* *Unlike*: the untouched impedance of one finger is more than twice that of the other. Without a
+  press nothing tells how sensitive such a finger is, so the estimate is the other's mean force.
+* *Alike*: all other pairs. Here the size of the signals tells how sensitive the finger is: signals
+  beyond {SAME_USE:g} times those of the other finger are scaled down, those from {SAME_USE**2:g}
+  times on to the same size.
+* *Pressed harder*: only the harder half of the presses is in the recording, so that larger signals
+  do not mean a more sensitive finger.
+* *New*: {report["new_fingers"]} more fingers, with which nothing was chosen. The rules above and
+  below were found on the other simulated fingers and on the real ones (training/LOG.md), whose
+  signals differ by a factor of 1.4, so that nothing is scaled.
+
+With labelled presses, each is left out in its turn. The error on it tells whether the scale of the
+estimates is wrong, and how much weight a ridge regression gets (on logarithms of impedances,
+learned from the same presses and corrected by them in the same way).
 
 With one press or more hardly any pair is worse than the constant, and from five on few are worse
 than the ridge regression.

@@ -12,9 +12,9 @@ from palpate.files.manifest import Manifest
 from palpate.messages import TrainingRange, ValueRange
 
 TASK_WORDS = {
-    "features": "Tared electrodes of one BioTac to the net force and the place of contact.",
-    "field": "Tared electrodes of one BioTac to fields on the skin.",
-    "synthesis": "Displacement of the skin to the tared electrodes of one BioTac.",
+    "features": "Net force and place of contact, from the tared electrodes of one BioTac.",
+    "field": "Fields on the skin, from the tared electrodes of one BioTac.",
+    "synthesis": "Tared electrodes of one BioTac, from the displacement of the skin.",
 }
 
 OUTPUT_WORDS = {
@@ -24,8 +24,8 @@ OUTPUT_WORDS = {
     "contact_location": "centre of the indenter's tip, as the paper labels it",
     "centre_of_pressure": "where the net force goes through the deformed skin",
     "contact_normal": "mean direction of contact forces, out of the skin",
-    "displacement": "of each node from the pressurised, untouched state",
-    "contact_force": "on each node; see the normalisation for how far it is spread",
+    "displacement": "of each node, from the pressurised, untouched state",
+    "contact_force": "on each node; spread over its neighbours as the list below says",
     "coefficients": "of the displacement in the bundle's own basis",
 }
 
@@ -49,7 +49,7 @@ def model_card(manifest: Manifest, digest: bytes) -> str:
         ("trained on", manifest.trained_on),
         (
             "made for",
-            ", ".join(manifest.sensor_serials) or "no sensor in particular: estimates say so",
+            ", ".join(manifest.sensor_serials) or "no sensor in particular; its estimates say so",
         ),
         ("training data", f"content sha256 `{manifest.training_data_sha256}`"),
         ("ONNX operator set", str(manifest.opset)),
@@ -104,20 +104,24 @@ def _bounds(intervals: Intervals | None) -> list[str]:
         return ["Not known: estimates give no bounds."]
     level = f"{intervals.level:.0%}"
     lines = [
-        f"Estimates give bounds that hold in {level} of the presses like these: "
-        f"{intervals.source}.",
+        f"Each estimate has bounds of its error. They hold in {level} of presses like those that"
+        f" they were learned from: {intervals.source}.",
         "",
     ]
     if not intervals.others:
-        lines.append("For sensors that it was not made for it gives none.")
+        lines.append("For sensors that it was not made for it gives no bounds.")
     else:
-        lines.append(f"For sensors that it was not made for, bounds by {intervals.others_source}.")
+        lines.append(
+            "Bounds for sensors that it was not made for were learned from"
+            f" {intervals.others_source}."
+        )
     rows = [
         (f"`{one.name}`", one.unit, whose, ", ".join(f"{weight:.4g}" for weight in one.weights))
         for whose, some in (("its own", intervals.formulas), ("others", intervals.others))
         for one in some
     ]
-    return [*lines, "", *_table(("bound of", "unit", "sensors", f"weights of {_TERMS}"), rows)]
+    lines += ["", "A bound is the exponential of the weighted sum of its terms.", ""]
+    return [*lines, *_table(("bound of", "unit", "sensors", f"weights of {_TERMS}"), rows)]
 
 
 _TERMS = ", ".join(TERMS)
@@ -149,7 +153,7 @@ def _ranges(known: TrainingRange | None) -> list[str]:
     ]
     lines += _table(("tensor", "unit", "smallest and largest of each value", "longest"), rows)
     if known.combinations:
-        lines += ["", "It also knows which inputs occur together, and flags those that do not."]
+        lines += ["", "It also knows which inputs occur together, and flags inputs that do not."]
     return lines
 
 
