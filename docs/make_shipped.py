@@ -120,7 +120,7 @@ palpate data generate runs/random --random 90 --seed 901 --registration-seed 0 -
 Columns are of rows with such a force. The 95 % interval is over presses; the constant is the mean
 of these rows, or nothing for skin and electrodes; the paper's is its best, on real sensors (of the
 skin: on its own simulations). The bounds of the first two bundles were learned from `calibrate`,
-`check` and [300 presses at random](intervals.md), weights from none of these. The robots of the
+`check` and [2,000 presses at random](intervals.md), weights from none of these. The robots of the
 first three sets stand wrong in another way than those of the training, which errors of the location
 include. What each bundle does on presses that its own training held out is on
 [its card](../models.md).

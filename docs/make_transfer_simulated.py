@@ -13,9 +13,10 @@ The constants of the method were chosen on two real fingers. Simulated ones have
 core's places and electrodes. Each is pressed ``PRESSES`` times, at random points by random
 indenters; a recording is made of these presses, with the drift of real sensors. Each finger is
 tested after each other one alone was learned from. What is done where a finger is more sensitive
-than others, and with the line beside, was found on those of the first file; with those of the
-second nothing was chosen. Without a press those of the first are tested once more, pressed by the
-harder half of their presses alone: then larger signals do not mean a more sensitive finger.
+than others, and with the line beside, was found on fingers of an earlier draw, whose skins and
+cores went together; with these nothing was chosen. Without a press those of the first file are
+tested once more, pressed by the harder half of their presses alone: then larger signals do not mean
+a more sensitive finger.
 """
 
 from __future__ import annotations

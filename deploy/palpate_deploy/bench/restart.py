@@ -5,8 +5,9 @@ others see it: the gateway a frame, a service an estimate of a later frame, the 
 that grows, the router a client that joins and hears an estimate. At the end the supervisor must
 have restarted exactly what was broken here.
 
-The floor is what no restart of ours can go below: a bare program under a bare supervisord, which
-has to notice the dead process and start another, and the imports of the foreign packages.
+The floor is the same without palpate's code: a bare program under a bare supervisord, which has to
+notice the dead process and start another, and the imports of the foreign packages. supervisord
+starts it a second later, so a restart of ours may take less than the floor.
 """
 
 from __future__ import annotations
