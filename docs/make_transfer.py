@@ -291,8 +291,8 @@ def worse_pairs(results: list[dict[str, Any]]) -> str:
     return "\n".join(
         [
             "Without a press, a finger whose signals are 1.2 to 1.5 times as large may be",
-            "estimated far worse than by a constant: a more sensitive finger and one pressed harder",
-            "look the same. Five presses tell them apart:",
+            "estimated far worse than by a constant: a more sensitive finger and one that is",
+            "pressed harder look the same. Five presses tell them apart:",
             "",
             *lines,
         ]
