@@ -26,6 +26,7 @@ from palpate_training.learning.export import (
 from palpate_training.learning.features_net import FeaturesNetConfig
 from palpate_training.learning.graphs import FeaturesGraph
 from palpate_training.learning.networks import Mlp, round_to_half
+from palpate_training.learning.splits import by_group
 from palpate_training.tasks.features import train_features
 
 MakeData = Callable[..., FeatureDataset]
@@ -215,6 +216,27 @@ def test_blocks_of_a_single_group_are_its_presses(press_data: MakeData, tmp_path
     manifest = read_bundle(tmp_path / "bundle").manifest
     assert "of 9 presses; tested on 2 other presses" in manifest.trained_on
     assert "force_magnitude_median_ci95_low_n" in manifest.metrics
+
+
+def test_bounds_leave_untouched_rows_out_where_contact_is_not_known(
+    press_data: MakeData, tmp_path: Path
+) -> None:
+    data = press_data(presses=12)
+    unknown = replace(
+        data,
+        in_contact=None,
+        contact_location=None,
+        centre_of_pressure=None,
+        contact_normal=None,
+    )
+    write_dataset(tmp_path / "unknown.h5", unknown)
+    train_features(tmp_path / "unknown.h5", tmp_path / "bundle", config=QUICK)
+    manifest = read_bundle(tmp_path / "bundle").manifest
+    force = data.force[by_group(data.group).test]
+    pressed = np.linalg.norm(force, axis=1) > manifest.contact_threshold_n
+    assert manifest.intervals is not None
+    assert manifest.intervals.source.startswith(f"{pressed.sum()} rows of 2 presses")
+    assert pressed.sum() < len(force)
 
 
 def test_forces_that_never_change_are_refused_before_training(

@@ -132,6 +132,33 @@ def test_rows_without_contact_are_left_out_and_not_enough(
         evaluate(of_features / "bundle", [tmp_path / "none.h5"])
 
 
+def test_where_contact_is_not_known_rows_above_the_threshold_count(
+    of_features: Path, tmp_path: Path
+) -> None:
+    data = open_dataset(of_features / "features.h5")
+    assert data.in_contact is not None
+    unknown = replace(
+        data,
+        in_contact=None,
+        contact_location=None,
+        centre_of_pressure=None,
+        contact_normal=None,
+    )
+    write_dataset(tmp_path / "unknown.h5", unknown)
+    threshold_n = read_bundle(of_features / "bundle").manifest.contact_threshold_n
+    pressed = np.linalg.norm(data.force, axis=1) > threshold_n
+    assert 0 < pressed.sum() < len(data)
+    found = evaluate(of_features / "bundle", [tmp_path / "unknown.h5"])
+    assert found.rows == pressed.sum()
+    for name, words in (
+        ("unknown.h5", f"above {threshold_n:g} N"),
+        ("mixed.h5", "in_contact says"),
+    ):
+        at = tmp_path if name == "unknown.h5" else of_features
+        told = ["evaluate", str(of_features / "bundle"), str(at / name)]
+        assert words in CliRunner().invoke(train_app, told, env={"COLUMNS": "200"}).output
+
+
 def test_one_press_has_no_interval(of_features: Path, tmp_path: Path) -> None:
     data = open_dataset(of_features / "features.h5")
     assert data.in_contact is not None

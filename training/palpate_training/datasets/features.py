@@ -92,6 +92,16 @@ class FeatureDataset:
         tared = self.electrodes.astype(np.float32) - self.baseline
         return tared.astype(np.float32, copy=False)
 
+    def touching(self, threshold_n: float) -> BoolArray:
+        """Which rows are in contact, shape ``(N,)``.
+
+        Args:
+            threshold_n: Force above which a row counts as such where ``in_contact`` is None [N].
+        """
+        if self.in_contact is not None:
+            return self.in_contact
+        return np.asarray(np.linalg.norm(self.force, axis=1) > threshold_n)
+
     def arrays(self) -> dict[str, npt.NDArray[np.generic]]:
         """The arrays that are present, by name, in the order of the schema."""
         named = {name: getattr(self, name) for name in FEATURE_COLUMNS}

@@ -136,6 +136,8 @@ class BundleErrors:
         presses: Which these rows are of.
         figures: By name and force.
         trained_on: Whether a data set is the one that the bundle was trained on.
+        assumed_contact_n: Force above which rows of a data set without ``in_contact`` count as in
+            contact [N]; None where every data set has it, or where all rows count.
     """
 
     bundle: str
@@ -146,6 +148,7 @@ class BundleErrors:
     presses: int
     figures: tuple[Figure, ...]
     trained_on: bool
+    assumed_contact_n: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For a JSON file: SI units, None where a number is not known."""
@@ -213,12 +216,15 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
     digests: set[str] = set()
     parts: list[_Errors] = []
     given: list[tuple[FloatArray, FloatArray]] = []
+    assumed_n = None
     for path in paths:
         if manifest.task == "features":
             data, provenance, digest = read_features(path)
+            if data.in_contact is None:
+                assumed_n = manifest.contact_threshold_n
             given.append((data.tared_counts, data.force))
             digests.add(data.content_sha256())  # of a mixed file, whose features were learned from
-            parts.append(_of_features(bundle, data, _rows_of_sensor(data, unit, path)))
+            parts.append(_of_features(bundle, data, _rows_of_sensor(bundle, data, unit, path)))
         else:
             mixed = read_mixed(path)
             _check_mesh(bundle, mixed, path)
@@ -241,6 +247,7 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
         presses=len(np.unique(errors.press)),
         figures=tuple(_figures(errors)),
         trained_on=manifest.training_data_sha256 in digests,
+        assumed_contact_n=assumed_n,
     )
 
 
@@ -266,8 +273,8 @@ def read_features(path: Path) -> tuple[FeatureDataset, Provenance, str]:
     return features(mixed), mixed.experiment.provenance, content_sha256(mixed)
 
 
-def _rows_of_sensor(data: FeatureDataset, unit: str | None, path: Path) -> Rows:
-    kept = np.ones(len(data), bool) if data.in_contact is None else data.in_contact
+def _rows_of_sensor(bundle: Bundle, data: FeatureDataset, unit: str | None, path: Path) -> Rows:
+    kept = data.touching(bundle.manifest.contact_threshold_n)
     if unit is not None:
         kept = kept & np.isin(data.sensor, _number(unit, data.sensor_names, path))
     return _some(np.flatnonzero(kept), path)

@@ -116,8 +116,9 @@ def train_features(
     split = by_group(press, seed=seed)
     x = data.tared_counts
     of_contact = _of_contact(data)
+    touched = data.touching(MIN_CONTACT_THRESHOLD_N)
     for side in (split.train, split.validation, split.test):
-        if of_contact and not of_contact[0][2][side].any():
+        if not touched[side].any():
             raise DatasetError(
                 f"{dataset_path}: a side of the split has no row in contact",
                 remedy="record more presses",
@@ -252,7 +253,7 @@ def _intervals(
         threshold: Force from which there is contact [N].
         seen: Representatives of the training rows.
     """
-    touching = np.ones(len(rows), bool) if data.in_contact is None else data.in_contact[rows]
+    touching = data.touching(threshold)[rows]
     kept, estimate = rows[touching], estimate[touching]
     size = np.linalg.norm(estimate[:, :3].astype(np.float64), axis=1)
     found = force_errors(estimate[:, :3], data.force[kept])
@@ -307,11 +308,7 @@ def _force_report(
 ) -> dict[str, float]:
     """Force metrics of the rows in contact, and how often contact itself is recognised."""
     truth = data.force[split.test]
-    touching = (
-        data.in_contact[split.test]
-        if data.in_contact is not None
-        else np.linalg.norm(truth, axis=1) > threshold
-    )
+    touching = data.touching(threshold)[split.test]
     metrics = force_metrics(estimate[touching], truth[touching])
     for model, fitted in (
         ("constant", baselines.constant(x[split.train], data.force[split.train])),

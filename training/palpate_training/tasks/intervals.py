@@ -65,8 +65,8 @@ class HeldOut:
 
 
 def held_out_features(bundle: Bundle, data: FeatureDataset) -> HeldOut:
-    """Errors of the rows in contact; where contact is not known, of all rows."""
-    rows = np.arange(len(data)) if data.in_contact is None else np.flatnonzero(data.in_contact)
+    """Errors of the rows in contact; where it is not known, of those above the bundle's threshold."""
+    rows = np.flatnonzero(data.touching(bundle.manifest.contact_threshold_n))
     tared, truth = data.tared_counts[rows], data.force[rows]
     answers = join(answers_of(bundle, lambda part: tared[part], np.arange(len(tared))))
     force = answers["force"]
