@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -311,8 +312,17 @@ def test_without_a_press_an_unlike_finger_is_estimated_no_worse_than_by_a_consta
 
 def test_what_cannot_be_tested_is_refused() -> None:
     one, two = finger(1), finger(2)
-    with pytest.raises(DatasetError, match="is among those to train on"):
+    with pytest.raises(
+        DatasetError, match=r"\(to test\) and finger-2 \(to train on\) hold the same"
+    ):
         run_transfer([one, two], replace(two, name="another name"))
+    whole = invented(2)
+    early: dict[str, Any] = {name: values[: ROWS // 2] for name, values in whole.arrays().items()}
+    (part,) = fingers_of(replace(whole, **early))
+    with pytest.raises(DatasetError, match=f"hold the same presses: {ROWS // 2} rows"):
+        run_transfer([one, part], two)
+    with pytest.raises(DatasetError, match=f"hold the same presses: {ROWS} rows"):
+        run_transfer([one, one], two)
     with pytest.raises(DatasetError, match="8 presses of 2 s, 8 are to be labelled"):
         run_transfer([one], two, shots=8)
     # Pieces of a second have no press of two; without labels none is needed.

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.container import add_array
+from palpate_training.datasets.container import add_array, refuse_repeated
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.metrics import force_errors
@@ -156,14 +156,12 @@ def run_transfer(
         largest; from `SAME_USE` on they are scaled down.
 
     Raises:
-        DatasetError: The tested finger is among the others, or has too few presses.
+        DatasetError: Two fingers have presses in common, or the tested one has too few.
     """
-    for finger in train:
-        if finger.digest == test.digest:
-            raise DatasetError(
-                f"the tested finger {test.name!r} is among those to train on, as {finger.name!r}",
-                remedy="test a finger that the training has not met",
-            )
+    refuse_repeated(
+        [*(f"{finger.name} (to train on)" for finger in train), f"{test.name} (to test)"],
+        [(finger.tared, finger.recording.force) for finger in (*train, test)],
+    )
     pieces = _presses(test.recording)
     if shots > (most := max(0, len(pieces) - 1)):
         raise DatasetError(
