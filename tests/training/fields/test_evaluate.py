@@ -20,7 +20,7 @@ from palpate_training.datasets.experiment import MixedDataset, write_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import open_dataset, write_dataset
 from palpate_training.learning.features_net import FeaturesNetConfig
-from palpate_training.learning.splits import by_trajectory, of_units
+from palpate_training.learning.splits import by_group, by_trajectory, of_units
 from palpate_training.tasks.evaluate import BundleErrors, Figure, evaluate
 from palpate_training.tasks.features import train_features
 from palpate_training.tasks.fields import FieldFitConfig, field_bundle
@@ -116,6 +116,16 @@ def test_features_of_both_kinds_of_file_and_of_one_specimen(of_features: Path) -
         evaluate(folder / "bundle", [folder / "features.h5"], unit="biotac-9")
 
 
+def test_a_part_of_the_training_is_known(of_features: Path, tmp_path: Path) -> None:
+    data = open_dataset(of_features / "features.h5")
+    split = by_group(data.group)
+    for side, rows in (("train", split.train[: len(split.train) // 2]), ("test", split.test)):
+        columns: dict[str, Any] = {name: values[rows] for name, values in data.arrays().items()}
+        write_dataset(tmp_path / f"{side}.h5", replace(data, **columns))
+        found = evaluate(of_features / "bundle", [tmp_path / f"{side}.h5"])
+        assert found.trained_on == (side == "train")
+
+
 def test_rows_without_contact_are_left_out_and_not_enough(
     of_features: Path, tmp_path: Path
 ) -> None:
@@ -180,7 +190,7 @@ def test_the_command_shows_and_writes(of_features: Path, tmp_path: Path) -> None
     told = ["evaluate", str(of_features / "bundle"), str(of_features / "features.h5")]
     shown = CliRunner().invoke(train_app, [*told, "--out", str(tmp_path / "out.json")])
     assert shown.exit_code == 0, shown.output
-    assert "It was trained on one of these data sets" in shown.output
+    assert "It was trained on presses of these data sets" in shown.output
     written = json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))
     assert written["schema"] == "palpate.evaluation 1"
     first = written["figures"][0]

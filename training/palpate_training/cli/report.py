@@ -167,8 +167,8 @@ def train_evaluate(
         console.print("Rows in contact, as in_contact says: others are left out.")
     if found.trained_on:
         console.print(
-            "[bold]It was trained on one of these data sets:[/bold] most of these rows are known to"
-            " it. Take presses that no training has seen."
+            "[bold]It was trained on presses of these data sets:[/bold] these are known to it. Take"
+            " presses that no training has seen."
         )
     if out is not None:
         with written_whole(out) as part:
