@@ -239,6 +239,21 @@ def test_bounds_leave_untouched_rows_out_where_contact_is_not_known(
     assert pressed.sum() < len(force)
 
 
+def test_contacts_are_learned_from_a_set_that_is_always_touched(
+    press_data: MakeData, tmp_path: Path
+) -> None:
+    data = press_data(presses=20)
+    assert data.in_contact is not None
+    columns: dict[str, Any] = {name: rows[data.in_contact] for name, rows in data.arrays().items()}
+    write_dataset(tmp_path / "touched.h5", replace(data, **{**columns, "in_contact": None}))
+    train_features(tmp_path / "touched.h5", tmp_path / "bundle", config=QUICK)
+    manifest = read_bundle(tmp_path / "bundle").manifest
+    outputs = {tensor.name for tensor in manifest.outputs}
+    assert {"contact_location", "centre_of_pressure", "contact_normal"} <= outputs
+    metrics, headline = manifest.metrics, "location_distance_median_m"
+    assert metrics[headline] < 0.7 * metrics[f"constant_{headline}"]
+
+
 def test_forces_that_never_change_are_refused_before_training(
     press_data: MakeData, tmp_path: Path
 ) -> None:

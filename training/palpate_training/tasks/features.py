@@ -280,9 +280,8 @@ NORMAL = "contact_normal"
 
 def _of_contact(data: FeatureDataset) -> list[tuple[str, FloatArray, BoolArray]]:
     """Quantities that only a contact has, as far as they are known: name, values, contact."""
-    touching = data.in_contact
-    if touching is None:
-        return []
+    # Without in_contact a data set has them in every row: it has been checked.
+    touching = np.ones(len(data), np.bool_) if data.in_contact is None else data.in_contact
     known = data.arrays()
     return [(name, getattr(data, name), touching) for name in OF_CONTACT if name in known]
 
