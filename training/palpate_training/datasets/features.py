@@ -160,9 +160,31 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
     )
 
 
+def recording_of(data: FeatureDataset) -> IndexArray:
+    """Recording of each row, shape ``(N,)``: the rows of a group that are of the same sensor."""
+    group = np.unique(data.group, return_inverse=True)[1].astype(np.int64)
+    pairs = group * len(data.sensor_names) + data.sensor
+    _, recording = np.unique(pairs, return_inverse=True)
+    return np.asarray(recording, np.int32)
+
+
 def press_of(data: FeatureDataset) -> IndexArray:
-    """Press of each row, shape ``(N,)``; a single group is told apart by its blocks."""
-    return data.group if len(np.unique(data.group)) > 1 else data.block
+    """Press of each row, shape ``(N,)``: its group, or of a sensor's only group its block.
+
+    A group of several sensors is one press as long as there are others: they were pressed alike.
+    """
+    recording = recording_of(data)
+    first = np.unique(recording, return_index=True)[1]
+    sensor = data.sensor[first]
+    _, group, sensors = np.unique(data.group[first], return_inverse=True, return_counts=True)
+    if len(sensors) == 1:
+        return data.block
+    alone = (np.bincount(sensor)[sensor] == 1) & (sensors[group] == 1)
+    if not alone.any():
+        return data.group
+    pairs = np.stack([data.group, np.where(alone[recording], data.block, 0)], axis=1)
+    _, press = np.unique(pairs, axis=0, return_inverse=True)
+    return press.reshape(-1).astype(np.int32)
 
 
 def of_sensor(data: FeatureDataset, name: str) -> FeatureDataset:
