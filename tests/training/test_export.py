@@ -209,12 +209,21 @@ def test_one_tested_press_tells_nothing_of_how_sure_its_error_is(
     assert not [name for name in metrics if "ci95" in name]
 
 
-def test_blocks_of_a_single_group_are_its_presses(press_data: MakeData, tmp_path: Path) -> None:
-    data = press_data(presses=12)
-    write_dataset(tmp_path / "one.h5", replace(data, group=np.zeros_like(data.group)))
-    train_features(tmp_path / "one.h5", tmp_path / "bundle", config=QUICK)
+@pytest.mark.parametrize(("step_ms", "guard"), [(10, 100), (None, 100), (50, 20)])
+def test_blocks_of_a_single_group_are_its_presses(
+    press_data: MakeData, tmp_path: Path, step_ms: int | None, guard: int
+) -> None:
+    data = press_data(presses=12, rows=240)
+    time_ns = None if step_ms is None else 1_000_000 * step_ms * np.arange(len(data))
+    one = replace(data, group=np.zeros_like(data.group), time_ns=time_ns)
+    write_dataset(tmp_path / "one.h5", one)
+    config = FeaturesNetConfig(members=1, width=8, blocks=1, epochs=1)
+    train_features(tmp_path / "one.h5", tmp_path / "bundle", config=config)
     manifest = read_bundle(tmp_path / "bundle").manifest
-    assert "of 9 presses; tested on 2 other presses" in manifest.trained_on
+    dealt = by_group(data.group)
+    tested = np.concatenate([dealt.validation, dealt.test])
+    apart = np.abs(dealt.train[:, None] - tested).min(axis=1) > guard  # a second
+    assert f"{apart.sum()} rows of 9 presses; tested on 2 other presses" in manifest.trained_on
     assert "force_magnitude_median_ci95_low_n" in manifest.metrics
 
 

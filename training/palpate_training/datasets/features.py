@@ -160,6 +160,17 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
     )
 
 
+NOMINAL_PERIOD_S = 0.01
+"""Time between rows where a data set has no times: a BioTac's 100 Hz."""
+
+
+def period_of(time_ns: TimeArray | None) -> float:
+    """Time between two rows of a sensor [s], the median; ``time_ns`` is that of its rows."""
+    steps = np.zeros(0) if time_ns is None else 1e-9 * np.diff(time_ns.astype(np.float64))
+    forward = steps[steps > 0.0]
+    return float(np.median(forward)) if len(forward) else NOMINAL_PERIOD_S
+
+
 def recording_of(data: FeatureDataset) -> IndexArray:
     """Recording of each row, shape ``(N,)``: the rows of a group that are of the same sensor."""
     group = np.unique(data.group, return_inverse=True)[1].astype(np.int64)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from palpate.errors import DatasetError
 from palpate_training.datasets.container import add_array, refuse_repeated
-from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.features import FeatureDataset, period_of
 from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.metrics import force_errors
 from palpate_training.learning.twin_line import TwinLine
@@ -38,9 +38,6 @@ Rows = npt.NDArray[np.integer]
 
 PRESS_S = 2.0
 GUARD_S = 1.0
-NOMINAL_PERIOD_S = 0.01
-"""Time between rows where a data set has no times: a BioTac's 100 Hz."""
-
 GAP_S = 1.0
 """A longer gap between rows ends an uninterrupted piece."""
 
@@ -85,17 +82,16 @@ def fingers_of(data: FeatureDataset) -> list[Finger]:
 def _finger(data: FeatureDataset, sensor: int) -> Finger:
     rows = np.flatnonzero(data.sensor == sensor)
     group = data.group[rows]
-    period_s, broken = NOMINAL_PERIOD_S, np.diff(group, prepend=group[:1]) != 0
-    if data.time_ns is not None:
-        steps_s = 1e-9 * np.diff(data.time_ns[rows].astype(np.float64))
-        forward = steps_s[steps_s > 0.0]
-        period_s = float(np.median(forward)) if len(forward) else NOMINAL_PERIOD_S
+    broken = np.diff(group, prepend=group[:1]) != 0
+    time_ns = None if data.time_ns is None else data.time_ns[rows]
+    if time_ns is not None:
+        steps_s = 1e-9 * np.diff(time_ns.astype(np.float64))
         broken = np.concatenate([[False], (steps_s > GAP_S) | (steps_s < 0.0)])
     recording = FingerRecording(
         data.electrodes[rows],
         data.baseline[rows],
         np.cumsum(broken),
-        period_s,
+        period_of(time_ns),
         data.force[rows].astype(np.float64),
     )
     return Finger(data.sensor_names[sensor], recording, data.tared_counts[rows])

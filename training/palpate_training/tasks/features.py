@@ -28,7 +28,9 @@ from palpate_training.datasets.features import (
     IndexArray,
     check_learnable,
     open_dataset,
+    period_of,
     press_of,
+    recording_of,
 )
 from palpate_training.learning import baselines
 from palpate_training.learning.export import export_features, refuse_existing
@@ -67,6 +69,10 @@ FALSE_CONTACT_SHARE = 0.001
 
 MIN_CONTACT_THRESHOLD_N = 0.05
 """No lower threshold than this, however quiet the training data [N]."""
+
+GUARD_S = 1.0
+"""Where presses are blocks of one recording, rows so near to those of another side are on none [s]:
+they are nearly copies."""
 
 _GOLDEN_ROWS = 64
 
@@ -113,7 +119,7 @@ def train_features(
     data = open_dataset(dataset_path)
     check_learnable(data)
     press = press_of(data)
-    split = by_group(press, seed=seed)
+    split = by_group(press, seed=seed, recording=recording_of(data), guard_rows=_guard_rows(data))
     x = data.tared_counts
     of_contact = _of_contact(data)
     touched = data.touching(MIN_CONTACT_THRESHOLD_N)
@@ -273,6 +279,16 @@ def _intervals(
         len(np.unique(press)),
         fit_formulas(errors, terms_of(size, common, distance), press),
     )
+
+
+def _guard_rows(data: FeatureDataset) -> int:
+    """Rows of ``GUARD_S``, of the sensor that has the most."""
+    times = data.time_ns
+    periods_s = (
+        period_of(None if times is None else times[data.sensor == sensor])
+        for sensor in np.unique(data.sensor)
+    )
+    return round(GUARD_S / min(periods_s))
 
 
 NORMAL = "contact_normal"
