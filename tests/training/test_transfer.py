@@ -14,12 +14,13 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.anatomy import ELECTRODE_MIRROR
-from palpate.errors import DatasetError
+from palpate.errors import ConfigError, DatasetError
 from palpate_training.cli import train_app
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.features import FeatureDataset, write_dataset
 from palpate_training.datasets.ingest import ingest_lasa
 from palpate_training.evaluation.transfer import Finger, fingers_of, run_transfer, worst_of
+from palpate_training.learning.twin_line import TwinLine, fit_line, read_line, write_line
 from palpate_training.systems import transfer
 from palpate_training.systems.transfer import FingerRecording, ForceTransfer, LabelledPresses
 
@@ -364,6 +365,32 @@ def test_command_prints_json(tmp_path: Path, shots: int) -> None:
     table = CliRunner().invoke(train_app, [*arguments, "--draws", "1"])
     assert "ridge" in table.output
     assert "90 % intervals" in table.output
+
+
+def test_the_prior_is_the_line_that_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[TwinLine | None] = []
+
+    def run(*_: object, line: TwinLine | None, **__: object) -> dict[str, Any]:
+        taken.append(line)
+        return {}
+
+    monkeypatch.setattr("palpate_training.evaluation.transfer.run_transfer", run)
+    for seed in (1, 2):
+        write_dataset(tmp_path / f"{seed}.h5", invented(seed))
+    write_line(tmp_path / "mine.json", fit_line(invented(3)))
+    arguments = ["transfer", "--train", str(tmp_path / "1.h5"), "--test", str(tmp_path / "2.h5")]
+    arguments += ["--json"]
+    mine = ["--line", str(tmp_path / "mine.json")]
+    for options in (mine, []):
+        done = CliRunner().invoke(train_app, arguments + options, catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+    named, shipped = (line.data_sha256 for line in taken if line is not None)
+    assert named == invented(3).content_sha256()
+    assert shipped == read_line().data_sha256
+    with pytest.raises(ConfigError, match="--no-twin is for none"):
+        CliRunner().invoke(train_app, [*arguments, *mine, "--no-twin"], catch_exceptions=False)
 
 
 @pytest.mark.slow
