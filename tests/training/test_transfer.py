@@ -336,6 +336,7 @@ def test_what_cannot_be_tested_is_refused() -> None:
 def test_draws_are_reproducible_and_leave_the_labelled_rows_out() -> None:
     results = [run_transfer([finger(1)], finger(2), shots=3, draws=2) for _ in range(2)]
     assert results[0] == results[1]
+    assert results[0]["rows"] == ROWS, "all that the finger has, whatever is drawn"
     other = run_transfer([finger(1)], finger(2), shots=3, draws=2, seed=1)
     assert other["magnitude_median_n"] != results[0]["magnitude_median_n"]
 
