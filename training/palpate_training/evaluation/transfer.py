@@ -145,9 +145,10 @@ def run_transfer(
         the true magnitudes inside their 90 % intervals), ``interval_median_n`` (half its width),
         and in ``constant`` and ``ridge`` the first three of a constant and of a ridge regression
         that know the same forces; which finger, how many presses and draws; ``rows``, all that the
-        finger has: those within a second of a labelled press are not tested; ``impedance_ratio``, the finger's untouched impedance over that of the nearest one trained
-        on, and ``unlike``, whether it is so far from 1 that nothing tells how sensitive this finger
-        is (`ALIKE`). Then, without a press, every estimate is the others' mean force.
+        finger has: those within a second of a labelled press are not tested; ``impedance_ratio``,
+        the finger's untouched impedance over that of the nearest one trained on, and ``unlike``,
+        whether it is so far from 1 that nothing tells how sensitive this finger is (`ALIKE`). Then,
+        without a press, every estimate is the others' mean force.
         ``signal_ratio``, the size of its signals over that of the finger trained on with the
         largest; from `SAME_USE` on they are scaled down.
 
