@@ -28,11 +28,10 @@ from rich.console import Console
 from palpate.files.bundle import read_bundle
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
-from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.features import NOMINAL_PERIOD_S, FeatureDataset
 from palpate_training.datasets.ingest import ingest_lasa
 from palpate_training.evaluation.transfer import (
     GUARD_S,
-    NOMINAL_PERIOD_S,
     PRESS_S,
     Finger,
     fingers_of,

@@ -248,6 +248,11 @@ def test_what_cannot_calibrate_is_refused(
         add_intervals(trained, [tmp_path / "few.h5"], out)
     with pytest.raises(BundleError, match="exists and bundles are immutable"):
         add_intervals(trained, [tmp_path / "few.h5"], trained)
+    data = press_data(presses=2)
+    still = np.zeros(len(data), bool)
+    write_dataset(tmp_path / "still.h5", replace(data, in_contact=still))
+    with pytest.raises(DatasetError, match="no row is in contact"):
+        add_intervals(trained, [tmp_path / "still.h5"], out)
     assert not out.exists()
 
 

@@ -26,6 +26,7 @@ from palpate_training.learning.export import (
 from palpate_training.learning.features_net import FeaturesNetConfig
 from palpate_training.learning.graphs import FeaturesGraph
 from palpate_training.learning.networks import Mlp, round_to_half
+from palpate_training.learning.splits import by_group
 from palpate_training.tasks.features import train_features
 
 MakeData = Callable[..., FeatureDataset]
@@ -208,13 +209,58 @@ def test_one_tested_press_tells_nothing_of_how_sure_its_error_is(
     assert not [name for name in metrics if "ci95" in name]
 
 
-def test_blocks_of_a_single_group_are_its_presses(press_data: MakeData, tmp_path: Path) -> None:
-    data = press_data(presses=12)
-    write_dataset(tmp_path / "one.h5", replace(data, group=np.zeros_like(data.group)))
-    train_features(tmp_path / "one.h5", tmp_path / "bundle", config=QUICK)
+@pytest.mark.parametrize(("step_ms", "guard"), [(10, 100), (None, 100), (50, 20)])
+def test_blocks_of_a_single_group_are_its_presses(
+    press_data: MakeData, tmp_path: Path, step_ms: int | None, guard: int
+) -> None:
+    data = press_data(presses=12, rows=240)
+    time_ns = None if step_ms is None else 1_000_000 * step_ms * np.arange(len(data))
+    one = replace(data, group=np.zeros_like(data.group), time_ns=time_ns)
+    write_dataset(tmp_path / "one.h5", one)
+    config = FeaturesNetConfig(members=1, width=8, blocks=1, epochs=1)
+    train_features(tmp_path / "one.h5", tmp_path / "bundle", config=config)
     manifest = read_bundle(tmp_path / "bundle").manifest
-    assert "of 9 presses; tested on 2 other presses" in manifest.trained_on
+    dealt = by_group(data.group)
+    tested = np.concatenate([dealt.validation, dealt.test])
+    apart = np.abs(dealt.train[:, None] - tested).min(axis=1) > guard  # a second
+    assert f"{apart.sum()} rows of 9 presses; tested on 2 other presses" in manifest.trained_on
     assert "force_magnitude_median_ci95_low_n" in manifest.metrics
+
+
+def test_bounds_leave_untouched_rows_out_where_contact_is_not_known(
+    press_data: MakeData, tmp_path: Path
+) -> None:
+    data = press_data(presses=12)
+    unknown = replace(
+        data,
+        in_contact=None,
+        contact_location=None,
+        centre_of_pressure=None,
+        contact_normal=None,
+    )
+    write_dataset(tmp_path / "unknown.h5", unknown)
+    train_features(tmp_path / "unknown.h5", tmp_path / "bundle", config=QUICK)
+    manifest = read_bundle(tmp_path / "bundle").manifest
+    force = data.force[by_group(data.group).test]
+    pressed = np.linalg.norm(force, axis=1) > manifest.contact_threshold_n
+    assert manifest.intervals is not None
+    assert manifest.intervals.source.startswith(f"{pressed.sum()} rows of 2 presses")
+    assert pressed.sum() < len(force)
+
+
+def test_contacts_are_learned_from_a_set_that_is_always_touched(
+    press_data: MakeData, tmp_path: Path
+) -> None:
+    data = press_data(presses=20)
+    assert data.in_contact is not None
+    columns: dict[str, Any] = {name: rows[data.in_contact] for name, rows in data.arrays().items()}
+    write_dataset(tmp_path / "touched.h5", replace(data, **{**columns, "in_contact": None}))
+    train_features(tmp_path / "touched.h5", tmp_path / "bundle", config=QUICK)
+    manifest = read_bundle(tmp_path / "bundle").manifest
+    outputs = {tensor.name for tensor in manifest.outputs}
+    assert {"contact_location", "centre_of_pressure", "contact_normal"} <= outputs
+    metrics, headline = manifest.metrics, "location_distance_median_m"
+    assert metrics[headline] < 0.7 * metrics[f"constant_{headline}"]
 
 
 def test_forces_that_never_change_are_refused_before_training(

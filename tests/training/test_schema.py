@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.features import FeatureDataset, open_dataset, write_dataset
+from palpate_training.datasets.features import FeatureDataset, open_dataset, press_of, write_dataset
 
 MakeData = Callable[..., FeatureDataset]
 
@@ -50,6 +50,28 @@ def test_content_hash_does_not_depend_on_the_layout(path: Path, data: FeatureDat
             copy.attrs["unit"] = source[name].attrs["unit"]
     assert relaid.read_bytes() != path.read_bytes()
     assert open_dataset(relaid).content_sha256() == data.content_sha256()
+
+
+def test_a_sensor_with_a_single_group_is_divided_by_its_blocks(press_data: MakeData) -> None:
+    def presses(sensor: list[int], group: list[int], block: list[int]) -> list[int]:
+        data = press_data(presses=6, rows=1)
+        labels = {"sensor": sensor, "group": group, "block": block}
+        arrays: dict[str, Any] = {
+            name: np.array(values, np.int32) for name, values in labels.items()
+        }
+        found = press_of(replace(data, **arrays, sensor_names=("one", "two")))
+        return list(np.unique(found, return_inverse=True)[1])
+
+    blocks = [0, 1, 2, 3, 4, 5]
+    assert presses([0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0, 0, 1, 1, 2, 2]) == [0, 0, 1, 1, 2, 2]
+    assert presses([0, 0, 0, 1, 1, 1], [0, 0, 0, 1, 1, 1], blocks) == blocks
+    # The first has presses, the second is one recording; blocks may have the numbers of groups.
+    mixed = presses([0, 0, 0, 1, 1, 1], [1, 1, 2, 0, 0, 0], [5, 4, 3, 2, 1, 1])
+    assert [number == mixed[0] for number in mixed] == [True, True, False, False, False, False]
+    assert len({*mixed}) == 4
+    assert mixed[4] == mixed[5]
+    # Both sensors were pressed alike: the same press is not on two sides.
+    assert presses([0, 0, 0, 0, 1, 1], [0, 0, 1, 1, 0, 0], blocks) == [0, 0, 1, 1, 0, 0]
 
 
 def test_content_hash_sees_every_value(data: FeatureDataset) -> None:

@@ -156,6 +156,29 @@ def test_groups_are_dealt_in_shares() -> None:
     assert (len(split.train), len(split.validation), len(split.test)) == (18_000, 1000, 1000)
 
 
+def test_groups_of_one_recording_are_kept_apart() -> None:
+    group, recording = labels([400, 300], blocks=10)
+    plain = by_group(group)
+    split = by_group(group, recording=recording, guard_rows=5)
+    check(split, len(group))
+    np.testing.assert_array_equal(split.test, plain.test)
+
+    def near(rows: splits.Rows, others: splits.Rows) -> splits.Mask:
+        apart = np.abs(rows[:, None] - others)
+        same = recording[rows][:, None] == recording[others]
+        return np.asarray(((apart <= 5) & same).any(axis=1))
+
+    assert (
+        split.validation.tolist() == plain.validation[~near(plain.validation, plain.test)].tolist()
+    )
+    tested = np.concatenate([plain.validation, plain.test])
+    assert split.train.tolist() == plain.train[~near(plain.train, tested)].tolist()
+    assert len(split.guard)
+    # A group that is a recording of its own borders on no other.
+    whole = by_group(group, recording=group, guard_rows=5)
+    assert not len(whole.guard)
+
+
 def test_what_cannot_be_split_is_named() -> None:
     block, recording = labels([300], blocks=5)
     with pytest.raises(DatasetError, match="5 blocks, 5 folds need 10"):
@@ -167,6 +190,8 @@ def test_what_cannot_be_split_is_named() -> None:
         unseen_sensor(recording, block, test_sensor=0)
     with pytest.raises(DatasetError, match="2 groups"):
         by_group(np.array([0, 1], dtype=np.int32))
+    with pytest.raises(DatasetError, match="a guard of 300 rows around blocks"):
+        by_group(block, recording=recording, guard_rows=300)
 
 
 def test_a_single_function_splits_rows_at_random() -> None:

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from palpate.files.bundle import read_bundle
 from palpate_training.cli import data_app, train_app
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks, write_dataset
 from palpate_training.datasets.ingest import ingest_lasa
+from palpate_training.learning.features_net import FeaturesNetConfig
 from palpate_training.learning.fit import FeaturesFitConfig
 from palpate_training.tasks import features, force_real
-from palpate_training.tasks.features import FeaturesReport
+from palpate_training.tasks.features import FeaturesReport, train_features
 from palpate_training.tasks.force_real import (
     experiment_count,
     run_force_real,
@@ -84,6 +86,16 @@ def test_a_bundle_has_the_version_that_its_folder_is_called(
     result = CliRunner().invoke(train_app, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert asked == [version]
+
+
+def test_recordings_of_two_fingers_are_divided_by_their_blocks(
+    two_sensors: FeatureDataset, tmp_path: Path
+) -> None:
+    write_dataset(tmp_path / "two.h5", two_sensors)
+    config = FeaturesNetConfig(members=1, width=8, blocks=1, epochs=1)
+    train_features(tmp_path / "two.h5", tmp_path / "bundle", config=config)
+    manifest = read_bundle(tmp_path / "bundle").manifest
+    assert "of 14 presses; tested on 4 other presses" in manifest.trained_on
 
 
 def test_experiment_reports_every_model_beside_the_baselines(

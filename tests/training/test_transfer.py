@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +14,13 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.anatomy import ELECTRODE_MIRROR
-from palpate.errors import DatasetError
+from palpate.errors import ConfigError, DatasetError
 from palpate_training.cli import train_app
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.features import FeatureDataset, write_dataset
 from palpate_training.datasets.ingest import ingest_lasa
 from palpate_training.evaluation.transfer import Finger, fingers_of, run_transfer, worst_of
+from palpate_training.learning.twin_line import TwinLine, fit_line, read_line, write_line
 from palpate_training.systems import transfer
 from palpate_training.systems.transfer import FingerRecording, ForceTransfer, LabelledPresses
 
@@ -311,8 +313,17 @@ def test_without_a_press_an_unlike_finger_is_estimated_no_worse_than_by_a_consta
 
 def test_what_cannot_be_tested_is_refused() -> None:
     one, two = finger(1), finger(2)
-    with pytest.raises(DatasetError, match="is among those to train on"):
+    with pytest.raises(
+        DatasetError, match=r"\(to test\) and finger-2 \(to train on\) hold the same"
+    ):
         run_transfer([one, two], replace(two, name="another name"))
+    whole = invented(2)
+    early: dict[str, Any] = {name: values[: ROWS // 2] for name, values in whole.arrays().items()}
+    (part,) = fingers_of(replace(whole, **early))
+    with pytest.raises(DatasetError, match=f"hold the same presses: {ROWS // 2} rows"):
+        run_transfer([one, part], two)
+    with pytest.raises(DatasetError, match=f"hold the same presses: {ROWS} rows"):
+        run_transfer([one, one], two)
     with pytest.raises(DatasetError, match="8 presses of 2 s, 8 are to be labelled"):
         run_transfer([one], two, shots=8)
     # Pieces of a second have no press of two; without labels none is needed.
@@ -325,6 +336,7 @@ def test_what_cannot_be_tested_is_refused() -> None:
 def test_draws_are_reproducible_and_leave_the_labelled_rows_out() -> None:
     results = [run_transfer([finger(1)], finger(2), shots=3, draws=2) for _ in range(2)]
     assert results[0] == results[1]
+    assert results[0]["rows"] == ROWS, "all that the finger has, whatever is drawn"
     other = run_transfer([finger(1)], finger(2), shots=3, draws=2, seed=1)
     assert other["magnitude_median_n"] != results[0]["magnitude_median_n"]
 
@@ -354,6 +366,32 @@ def test_command_prints_json(tmp_path: Path, shots: int) -> None:
     table = CliRunner().invoke(train_app, [*arguments, "--draws", "1"])
     assert "ridge" in table.output
     assert "90 % intervals" in table.output
+
+
+def test_the_prior_is_the_line_that_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[TwinLine | None] = []
+
+    def run(*_: object, line: TwinLine | None, **__: object) -> dict[str, Any]:
+        taken.append(line)
+        return {}
+
+    monkeypatch.setattr("palpate_training.evaluation.transfer.run_transfer", run)
+    for seed in (1, 2):
+        write_dataset(tmp_path / f"{seed}.h5", invented(seed))
+    write_line(tmp_path / "mine.json", fit_line(invented(3)))
+    arguments = ["transfer", "--train", str(tmp_path / "1.h5"), "--test", str(tmp_path / "2.h5")]
+    arguments += ["--json"]
+    mine = ["--line", str(tmp_path / "mine.json")]
+    for options in (mine, []):
+        done = CliRunner().invoke(train_app, arguments + options, catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+    named, shipped = (line.data_sha256 for line in taken if line is not None)
+    assert named == invented(3).content_sha256()
+    assert shipped == read_line().data_sha256
+    with pytest.raises(ConfigError, match="--no-twin is for none"):
+        CliRunner().invoke(train_app, [*arguments, *mine, "--no-twin"], catch_exceptions=False)
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from palpate_training.evaluation.cells import (
 )
 from palpate_training.learning.splits import Fold, RowSplit
 from palpate_training.systems.fields import FIELD_SYSTEMS
+from palpate_training.systems.statistical import STATISTICAL
 
 ROWS = RowSplit(*(np.arange(start, start + 4) for start in (0, 4, 8, 12)))
 FOLD = Fold("trajectory", "all units", "", ROWS)
@@ -92,16 +93,27 @@ def test_what_decides_a_cell_is_in_its_name() -> None:
     assert cell_key(task, cell) == cell_key(task, replace(cell))
 
 
-@pytest.mark.parametrize("module", ["systems/latent", "tasks/fields", "learning/fit"])
+RIDGE = next(system for system in STATISTICAL if "ridge" in system.name)
+
+
+@pytest.mark.parametrize(
+    ("system", "module"),
+    [
+        (FIELD_SYSTEMS[-1], "systems/latent"),
+        (FIELD_SYSTEMS[-1], "tasks/fields"),
+        (FIELD_SYSTEMS[-1], "learning/fit"),
+        (RIDGE, "learning/baselines"),
+    ],
+)
 def test_code_that_a_system_builds_on_is_in_its_name(
-    monkeypatch: pytest.MonkeyPatch, module: str
+    monkeypatch: pytest.MonkeyPatch, system: cells.Tested, module: str
 ) -> None:
-    before = cells.code_of(FIELD_SYSTEMS[-1])
+    before = cells.code_of(system)
     original = cells._file_sha256
     monkeypatch.setattr(
         cells, "_file_sha256", lambda path: "changed" if module in path else original(path)
     )
-    assert cells.code_of(FIELD_SYSTEMS[-1]) != before
+    assert cells.code_of(system) != before
 
 
 def test_what_was_made_before_a_failure_is_kept(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from palpate_training.datasets.experiment import MixedDataset, write_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import open_dataset, write_dataset
 from palpate_training.learning.features_net import FeaturesNetConfig
-from palpate_training.learning.splits import by_trajectory, of_units
+from palpate_training.learning.splits import by_group, by_trajectory, of_units
 from palpate_training.tasks.evaluate import BundleErrors, Figure, evaluate
 from palpate_training.tasks.features import train_features
 from palpate_training.tasks.fields import FieldFitConfig, field_bundle
@@ -116,6 +116,16 @@ def test_features_of_both_kinds_of_file_and_of_one_specimen(of_features: Path) -
         evaluate(folder / "bundle", [folder / "features.h5"], unit="biotac-9")
 
 
+def test_a_part_of_the_training_is_known(of_features: Path, tmp_path: Path) -> None:
+    data = open_dataset(of_features / "features.h5")
+    split = by_group(data.group)
+    for side, rows in (("train", split.train[: len(split.train) // 2]), ("test", split.test)):
+        columns: dict[str, Any] = {name: values[rows] for name, values in data.arrays().items()}
+        write_dataset(tmp_path / f"{side}.h5", replace(data, **columns))
+        found = evaluate(of_features / "bundle", [tmp_path / f"{side}.h5"])
+        assert found.trained_on == (side == "train")
+
+
 def test_rows_without_contact_are_left_out_and_not_enough(
     of_features: Path, tmp_path: Path
 ) -> None:
@@ -130,6 +140,33 @@ def test_rows_without_contact_are_left_out_and_not_enough(
     write_dataset(tmp_path / "none.h5", none)
     with pytest.raises(DatasetError, match="no row is in contact"):
         evaluate(of_features / "bundle", [tmp_path / "none.h5"])
+
+
+def test_where_contact_is_not_known_rows_above_the_threshold_count(
+    of_features: Path, tmp_path: Path
+) -> None:
+    data = open_dataset(of_features / "features.h5")
+    assert data.in_contact is not None
+    unknown = replace(
+        data,
+        in_contact=None,
+        contact_location=None,
+        centre_of_pressure=None,
+        contact_normal=None,
+    )
+    write_dataset(tmp_path / "unknown.h5", unknown)
+    threshold_n = read_bundle(of_features / "bundle").manifest.contact_threshold_n
+    pressed = np.linalg.norm(data.force, axis=1) > threshold_n
+    assert 0 < pressed.sum() < len(data)
+    found = evaluate(of_features / "bundle", [tmp_path / "unknown.h5"])
+    assert found.rows == pressed.sum()
+    for name, words in (
+        ("unknown.h5", f"above {threshold_n:g} N"),
+        ("mixed.h5", "in_contact says"),
+    ):
+        at = tmp_path if name == "unknown.h5" else of_features
+        told = ["evaluate", str(of_features / "bundle"), str(at / name)]
+        assert words in CliRunner().invoke(train_app, told, env={"COLUMNS": "200"}).output
 
 
 def test_one_press_has_no_interval(of_features: Path, tmp_path: Path) -> None:
@@ -153,7 +190,7 @@ def test_the_command_shows_and_writes(of_features: Path, tmp_path: Path) -> None
     told = ["evaluate", str(of_features / "bundle"), str(of_features / "features.h5")]
     shown = CliRunner().invoke(train_app, [*told, "--out", str(tmp_path / "out.json")])
     assert shown.exit_code == 0, shown.output
-    assert "It was trained on one of these data sets" in shown.output
+    assert "It was trained on presses of these data sets" in shown.output
     written = json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))
     assert written["schema"] == "palpate.evaluation 1"
     first = written["figures"][0]

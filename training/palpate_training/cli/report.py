@@ -158,10 +158,17 @@ def train_evaluate(
         raise ConfigError(f"{out} exists", remedy="name another file with --out")
     found = evaluate(bundle, data, unit=unit)
     console.print(_table(found))
+    if found.assumed_contact_n is not None:
+        console.print(
+            f"Where in_contact is not known, rows above {found.assumed_contact_n:g} N count as in"
+            " contact: others are left out."
+        )
+    elif found.task == "features":
+        console.print("Rows in contact, as in_contact says: others are left out.")
     if found.trained_on:
         console.print(
-            "[bold]It was trained on one of these data sets:[/bold] most of these rows are known to"
-            " it. Take presses that no training has seen."
+            "[bold]It was trained on presses of these data sets:[/bold] these are known to it. Take"
+            " presses that no training has seen."
         )
     if out is not None:
         with written_whole(out) as part:

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
 from palpate.files.bundle import read_bundle
 from palpate.files.card import model_card
@@ -266,6 +267,12 @@ def train_transfer(
     twin: Annotated[
         bool, typer.Option(help="Whether a line through the twin's presses is the prior.")
     ] = True,
+    line: Annotated[
+        Path | None,
+        typer.Option(
+            help="Line of `palpate train line` to take as the prior; none = the one that ships."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
     """Force on a finger that training has not met, and after a few presses of it.
@@ -282,7 +289,11 @@ def train_transfer(
     from palpate_training.learning.twin_line import read_line
     from palpate_training.systems.transfer import SAME_USE
 
-    line = read_line() if twin else None
+    if line is not None and not twin:
+        raise ConfigError(
+            "--line names a prior, --no-twin is for none", remedy="leave one of them out"
+        )
+    prior = read_line(line) if twin else None
     known = [finger for path in train for finger in fingers_of(open_dataset(path))]
     tested = fingers_of(open_dataset(test))
     with _progress(Console(stderr=True)) as progress:
@@ -296,7 +307,7 @@ def train_transfer(
                 unlabelled=shots > 0 if unlabelled is None else unlabelled,
                 draws=draws,
                 seed=seed,
-                line=line,
+                line=prior,
                 on_step=lambda: progress.advance(bar),
             )
             for finger in tested
@@ -459,7 +470,7 @@ def train_line(
     ],
     out: Annotated[Path, typer.Argument(metavar="LINE.json", help="File to write.")],
 ) -> None:
-    """A line through a population's presses, for `palpate train transfer`.
+    """A line through a population's presses, for `palpate train transfer --line`.
 
     palpate train line features.h5 twin-line.json
     """

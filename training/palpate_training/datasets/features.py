@@ -92,6 +92,16 @@ class FeatureDataset:
         tared = self.electrodes.astype(np.float32) - self.baseline
         return tared.astype(np.float32, copy=False)
 
+    def touching(self, threshold_n: float) -> BoolArray:
+        """Which rows are in contact, shape ``(N,)``.
+
+        Args:
+            threshold_n: Force above which a row counts as such where ``in_contact`` is None [N].
+        """
+        if self.in_contact is not None:
+            return self.in_contact
+        return np.asarray(np.linalg.norm(self.force, axis=1) > threshold_n)
+
     def arrays(self) -> dict[str, npt.NDArray[np.generic]]:
         """The arrays that are present, by name, in the order of the schema."""
         named = {name: getattr(self, name) for name in FEATURE_COLUMNS}
@@ -150,9 +160,42 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
     )
 
 
+NOMINAL_PERIOD_S = 0.01
+"""Time between rows where a data set has no times: a BioTac's 100 Hz."""
+
+
+def period_of(time_ns: TimeArray | None) -> float:
+    """Time between two rows of a sensor [s], the median; ``time_ns`` is that of its rows."""
+    steps = np.zeros(0) if time_ns is None else 1e-9 * np.diff(time_ns.astype(np.float64))
+    forward = steps[steps > 0.0]
+    return float(np.median(forward)) if len(forward) else NOMINAL_PERIOD_S
+
+
+def recording_of(data: FeatureDataset) -> IndexArray:
+    """Recording of each row, shape ``(N,)``: the rows of a group that are of the same sensor."""
+    group = np.unique(data.group, return_inverse=True)[1].astype(np.int64)
+    pairs = group * len(data.sensor_names) + data.sensor
+    _, recording = np.unique(pairs, return_inverse=True)
+    return np.asarray(recording, np.int32)
+
+
 def press_of(data: FeatureDataset) -> IndexArray:
-    """Press of each row, shape ``(N,)``; a single group is told apart by its blocks."""
-    return data.group if len(np.unique(data.group)) > 1 else data.block
+    """Press of each row, shape ``(N,)``: its group, or of a sensor's only group its block.
+
+    A group of several sensors is one press as long as there are others: they were pressed alike.
+    """
+    recording = recording_of(data)
+    first = np.unique(recording, return_index=True)[1]
+    sensor = data.sensor[first]
+    _, group, sensors = np.unique(data.group[first], return_inverse=True, return_counts=True)
+    if len(sensors) == 1:
+        return data.block
+    alone = (np.bincount(sensor)[sensor] == 1) & (sensors[group] == 1)
+    if not alone.any():
+        return data.group
+    pairs = np.stack([data.group, np.where(alone[recording], data.block, 0)], axis=1)
+    _, press = np.unique(pairs, axis=0, return_inverse=True)
+    return press.reshape(-1).astype(np.int32)
 
 
 def of_sensor(data: FeatureDataset, name: str) -> FeatureDataset:

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -157,8 +158,13 @@ def code_of(system: Tested) -> str:
             continue
         module = sys.modules[name]
         files[name] = _file_sha256(str(module.__file__))
-        # What a module imports by name knows where it was defined.
-        waiting += [str(getattr(value, "__module__", "")) for value in vars(module).values()]
+        # What a module imports by name knows where it was defined; a whole module is its own.
+        waiting += [
+            value.__name__
+            if isinstance(value, ModuleType)
+            else str(getattr(value, "__module__", ""))
+            for value in vars(module).values()
+        ]
     return hashlib.sha256(json.dumps(sorted(files.items())).encode()).hexdigest()
 
 

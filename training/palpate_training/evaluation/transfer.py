@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.container import add_array
-from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.container import add_array, refuse_repeated
+from palpate_training.datasets.features import FeatureDataset, period_of
 from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.metrics import force_errors
 from palpate_training.learning.twin_line import TwinLine
@@ -38,9 +38,6 @@ Rows = npt.NDArray[np.integer]
 
 PRESS_S = 2.0
 GUARD_S = 1.0
-NOMINAL_PERIOD_S = 0.01
-"""Time between rows where a data set has no times: a BioTac's 100 Hz."""
-
 GAP_S = 1.0
 """A longer gap between rows ends an uninterrupted piece."""
 
@@ -85,17 +82,16 @@ def fingers_of(data: FeatureDataset) -> list[Finger]:
 def _finger(data: FeatureDataset, sensor: int) -> Finger:
     rows = np.flatnonzero(data.sensor == sensor)
     group = data.group[rows]
-    period_s, broken = NOMINAL_PERIOD_S, np.diff(group, prepend=group[:1]) != 0
-    if data.time_ns is not None:
-        steps_s = 1e-9 * np.diff(data.time_ns[rows].astype(np.float64))
-        forward = steps_s[steps_s > 0.0]
-        period_s = float(np.median(forward)) if len(forward) else NOMINAL_PERIOD_S
+    broken = np.diff(group, prepend=group[:1]) != 0
+    time_ns = None if data.time_ns is None else data.time_ns[rows]
+    if time_ns is not None:
+        steps_s = 1e-9 * np.diff(time_ns.astype(np.float64))
         broken = np.concatenate([[False], (steps_s > GAP_S) | (steps_s < 0.0)])
     recording = FingerRecording(
         data.electrodes[rows],
         data.baseline[rows],
         np.cumsum(broken),
-        period_s,
+        period_of(time_ns),
         data.force[rows].astype(np.float64),
     )
     return Finger(data.sensor_names[sensor], recording, data.tared_counts[rows])
@@ -148,22 +144,21 @@ def run_transfer(
         ``magnitude_median_n``, ``magnitude_p95_n``, ``angle_median_rad``, ``coverage_90`` (share of
         the true magnitudes inside their 90 % intervals), ``interval_median_n`` (half its width),
         and in ``constant`` and ``ridge`` the first three of a constant and of a ridge regression
-        that know the same forces; which finger, how many presses, draws and tested rows;
-        ``impedance_ratio``, the finger's untouched impedance over that of the nearest one trained
-        on, and ``unlike``, whether it is so far from 1 that nothing tells how sensitive this finger
-        is (`ALIKE`). Then, without a press, every estimate is the others' mean force.
+        that know the same forces; which finger, how many presses and draws; ``rows``, all that the
+        finger has: those within a second of a labelled press are not tested; ``impedance_ratio``,
+        the finger's untouched impedance over that of the nearest one trained on, and ``unlike``,
+        whether it is so far from 1 that nothing tells how sensitive this finger is (`ALIKE`). Then,
+        without a press, every estimate is the others' mean force.
         ``signal_ratio``, the size of its signals over that of the finger trained on with the
         largest; from `SAME_USE` on they are scaled down.
 
     Raises:
-        DatasetError: The tested finger is among the others, or has too few presses.
+        DatasetError: Two fingers have presses in common, or the tested one has too few.
     """
-    for finger in train:
-        if finger.digest == test.digest:
-            raise DatasetError(
-                f"the tested finger {test.name!r} is among those to train on, as {finger.name!r}",
-                remedy="test a finger that the training has not met",
-            )
+    refuse_repeated(
+        [*(f"{finger.name} (to train on)" for finger in train), f"{test.name} (to test)"],
+        [(finger.tared, finger.recording.force) for finger in (*train, test)],
+    )
     pieces = _presses(test.recording)
     if shots > (most := max(0, len(pieces) - 1)):
         raise DatasetError(

@@ -132,11 +132,29 @@ HELD_OUT_MOST = 1000
 
 
 def by_group(
-    group: Labels, *, test_share: float = 0.2, validation_share: float = 0.1, seed: int = 0
+    group: Labels,
+    *,
+    test_share: float = 0.2,
+    validation_share: float = 0.1,
+    seed: int = 0,
+    recording: Labels | None = None,
+    guard_rows: int = 0,
 ) -> RowSplit:
     """Deal whole groups (presses, trajectories) to test, validation and train.
 
     Test and validation get their shares, but ``HELD_OUT_MOST`` groups each at most.
+
+    Args:
+        group: Group of every row, shape ``(N,)``.
+        test_share: Of the groups.
+        validation_share: Of the groups.
+        seed: Deals the groups.
+        recording: Recording of every row, shape ``(N,)``, rows in order of time, where groups may
+            be pieces of one; None = no group goes on where another one ends.
+        guard_rows: Rows left out on either side of a border between two sides in a recording.
+
+    Raises:
+        DatasetError: There are fewer than three groups, or the guard leaves a side empty.
     """
     groups = np.unique(group)
     if len(groups) < 3:
@@ -151,8 +169,17 @@ def by_group(
     )
     test = np.isin(group, dealt[:tests])
     validation = np.isin(group, dealt[tests : tests + validations])
-    # No guard: a group starts and ends without contact, so neighbours across it share nothing.
-    return _guarded(validation, test, group, guard_rows=0)
+    if recording is None:
+        # No guard: a group starts and ends without contact, so neighbours across it share nothing.
+        return _guarded(validation, test, group, guard_rows=0)
+    split = _guarded(validation, test, recording, guard_rows)
+    if not (len(split.train) and len(split.validation)):
+        raise DatasetError(
+            f"a guard of {guard_rows} rows around blocks of a recording leaves nothing to train or"
+            " validate on",
+            remedy="record longer, or say which rows are one press: group",
+        )
+    return split
 
 
 def _guarded(validation: Mask, test: Mask, recording: Labels, guard_rows: int) -> RowSplit:
@@ -169,13 +196,15 @@ def _near(mask: Mask, recording: Labels, distance: int) -> Mask:
     near = mask.copy()
     if distance == 0:
         return near
-    for one in np.unique(recording):
-        rows = np.flatnonzero(recording == one)
-        marked = np.concatenate([[0], np.cumsum(mask[rows])])
-        index = np.arange(len(rows))
-        low = np.maximum(index - distance, 0)
-        high = np.minimum(index + distance + 1, len(rows))
-        near[rows] = marked[high] > marked[low]
+    # Recordings may be as many as presses: they are sorted, not searched for one after the other.
+    order = np.argsort(recording, kind="stable")
+    _, first, rows = np.unique(recording[order], return_index=True, return_counts=True)
+    start, end = np.repeat(first, rows), np.repeat(first + rows, rows)
+    marked = np.concatenate([[0], np.cumsum(mask[order])])
+    index = np.arange(len(order))
+    low = np.maximum(index - distance, start)
+    high = np.minimum(index + distance + 1, end)
+    near[order] = marked[high] > marked[low]
     return near
 
 

@@ -49,6 +49,7 @@ from palpate_training.learning.metrics import (
     join,
     root_mean,
 )
+from palpate_training.learning.ranges import holds_known
 from palpate_training.learning.splits import Rows
 from palpate_training.tasks.features import NORMAL, several
 from palpate_training.tasks.fields import tared_counts
@@ -135,7 +136,9 @@ class BundleErrors:
         rows: Of all data sets, those that are not in contact left out.
         presses: Which these rows are of.
         figures: By name and force.
-        trained_on: Whether a data set is the one that the bundle was trained on.
+        trained_on: Whether a data set holds presses that the bundle was trained on.
+        assumed_contact_n: Force above which rows of a data set without ``in_contact`` count as in
+            contact [N]; None where every data set has it, or where all rows count.
     """
 
     bundle: str
@@ -146,6 +149,7 @@ class BundleErrors:
     presses: int
     figures: tuple[Figure, ...]
     trained_on: bool
+    assumed_contact_n: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For a JSON file: SI units, None where a number is not known."""
@@ -213,12 +217,18 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
     digests: set[str] = set()
     parts: list[_Errors] = []
     given: list[tuple[FloatArray, FloatArray]] = []
+    inputs: list[FloatArray] = []
+    assumed_n = None
     for path in paths:
         if manifest.task == "features":
             data, provenance, digest = read_features(path)
+            if data.in_contact is None:
+                assumed_n = manifest.contact_threshold_n
             given.append((data.tared_counts, data.force))
             digests.add(data.content_sha256())  # of a mixed file, whose features were learned from
-            parts.append(_of_features(bundle, data, _rows_of_sensor(data, unit, path)))
+            rows = _rows_of_sensor(bundle, data, unit, path)
+            inputs.append(data.tared_counts[rows])
+            parts.append(_of_features(bundle, data, rows))
         else:
             mixed = read_mixed(path)
             _check_mesh(bundle, mixed, path)
@@ -226,12 +236,14 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
             given.append((experiment.tared, experiment.force))
             provenance, digest = experiment.provenance, content_sha256(mixed)
             rows = _rows_of_unit(experiment, unit, path)
+            inputs.append(tared_counts(mixed)[rows])
             of = _of_field if manifest.task == "field" else _of_synthesis
             parts.append(of(bundle, mixed, rows))
         about.append((provenance.source, digest))
         digests.add(digest)
     refuse_repeated(paths, given)
     errors = _joined(parts)
+    known = bundle.known_inputs
     return BundleErrors(
         bundle=f"{manifest.name} {manifest.version}",
         sha256=bundle.sha256.hex(),
@@ -240,7 +252,10 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
         rows=len(errors.press),
         presses=len(np.unique(errors.press)),
         figures=tuple(_figures(errors)),
-        trained_on=manifest.training_data_sha256 in digests,
+        trained_on=manifest.training_data_sha256 in digests
+        # A part of the training, or a copy of it, has another digest.
+        or (known is not None and any(holds_known(known, tared) for tared in inputs)),
+        assumed_contact_n=assumed_n,
     )
 
 
@@ -266,8 +281,8 @@ def read_features(path: Path) -> tuple[FeatureDataset, Provenance, str]:
     return features(mixed), mixed.experiment.provenance, content_sha256(mixed)
 
 
-def _rows_of_sensor(data: FeatureDataset, unit: str | None, path: Path) -> Rows:
-    kept = np.ones(len(data), bool) if data.in_contact is None else data.in_contact
+def _rows_of_sensor(bundle: Bundle, data: FeatureDataset, unit: str | None, path: Path) -> Rows:
+    kept = data.touching(bundle.manifest.contact_threshold_n)
     if unit is not None:
         kept = kept & np.isin(data.sensor, _number(unit, data.sensor_names, path))
     return _some(np.flatnonzero(kept), path)

@@ -28,7 +28,9 @@ from palpate_training.datasets.features import (
     IndexArray,
     check_learnable,
     open_dataset,
+    period_of,
     press_of,
+    recording_of,
 )
 from palpate_training.learning import baselines
 from palpate_training.learning.export import export_features, refuse_existing
@@ -67,6 +69,10 @@ FALSE_CONTACT_SHARE = 0.001
 
 MIN_CONTACT_THRESHOLD_N = 0.05
 """No lower threshold than this, however quiet the training data [N]."""
+
+GUARD_S = 1.0
+"""Where presses are blocks of one recording, rows so near to those of another side are on none [s]:
+they are nearly copies."""
 
 _GOLDEN_ROWS = 64
 
@@ -113,11 +119,12 @@ def train_features(
     data = open_dataset(dataset_path)
     check_learnable(data)
     press = press_of(data)
-    split = by_group(press, seed=seed)
+    split = by_group(press, seed=seed, recording=recording_of(data), guard_rows=_guard_rows(data))
     x = data.tared_counts
     of_contact = _of_contact(data)
+    touched = data.touching(MIN_CONTACT_THRESHOLD_N)
     for side in (split.train, split.validation, split.test):
-        if of_contact and not of_contact[0][2][side].any():
+        if not touched[side].any():
             raise DatasetError(
                 f"{dataset_path}: a side of the split has no row in contact",
                 remedy="record more presses",
@@ -252,7 +259,7 @@ def _intervals(
         threshold: Force from which there is contact [N].
         seen: Representatives of the training rows.
     """
-    touching = np.ones(len(rows), bool) if data.in_contact is None else data.in_contact[rows]
+    touching = data.touching(threshold)[rows]
     kept, estimate = rows[touching], estimate[touching]
     size = np.linalg.norm(estimate[:, :3].astype(np.float64), axis=1)
     found = force_errors(estimate[:, :3], data.force[kept])
@@ -274,14 +281,23 @@ def _intervals(
     )
 
 
+def _guard_rows(data: FeatureDataset) -> int:
+    """Rows of ``GUARD_S``, of the sensor that has the most."""
+    times = data.time_ns
+    periods_s = (
+        period_of(None if times is None else times[data.sensor == sensor])
+        for sensor in np.unique(data.sensor)
+    )
+    return round(GUARD_S / min(periods_s))
+
+
 NORMAL = "contact_normal"
 
 
 def _of_contact(data: FeatureDataset) -> list[tuple[str, FloatArray, BoolArray]]:
     """Quantities that only a contact has, as far as they are known: name, values, contact."""
-    touching = data.in_contact
-    if touching is None:
-        return []
+    # Without in_contact a data set has them in every row: it has been checked.
+    touching = np.ones(len(data), np.bool_) if data.in_contact is None else data.in_contact
     known = data.arrays()
     return [(name, getattr(data, name), touching) for name in OF_CONTACT if name in known]
 
@@ -307,11 +323,7 @@ def _force_report(
 ) -> dict[str, float]:
     """Force metrics of the rows in contact, and how often contact itself is recognised."""
     truth = data.force[split.test]
-    touching = (
-        data.in_contact[split.test]
-        if data.in_contact is not None
-        else np.linalg.norm(truth, axis=1) > threshold
-    )
+    touching = data.touching(threshold)[split.test]
     metrics = force_metrics(estimate[touching], truth[touching])
     for model, fitted in (
         ("constant", baselines.constant(x[split.train], data.force[split.train])),

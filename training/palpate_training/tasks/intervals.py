@@ -65,8 +65,16 @@ class HeldOut:
 
 
 def held_out_features(bundle: Bundle, data: FeatureDataset) -> HeldOut:
-    """Errors of the rows in contact; where contact is not known, of all rows."""
-    rows = np.arange(len(data)) if data.in_contact is None else np.flatnonzero(data.in_contact)
+    """Errors of the rows in contact; if that is not known, of those above its threshold.
+
+    Raises:
+        DatasetError: There are none.
+    """
+    rows = np.flatnonzero(data.touching(bundle.manifest.contact_threshold_n))
+    if not len(rows):
+        raise DatasetError(
+            f"{data.name}: no row is in contact", remedy="take a data set with presses"
+        )
     tared, truth = data.tared_counts[rows], data.force[rows]
     answers = join(answers_of(bundle, lambda part: tared[part], np.arange(len(tared))))
     force = answers["force"]
