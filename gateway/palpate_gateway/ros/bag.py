@@ -22,7 +22,7 @@ from palpate_gateway.device import DeviceIdentity, FileDevice
 from palpate_gateway.protocols.ros_hands import RosFinger, RosHand, decode_hand
 from palpate_gateway.readings import ElectrodeReading, WrenchReading
 from palpate_gateway.ros.biotac import RosFingerOptions
-from palpate_gateway.ros.wrench import decode_wrench
+from palpate_gateway.ros.wrench import RosWrenchMessage, decode_wrench
 from palpate_gateway.wrench.device import Mount, MountOptions
 
 _TACTILE = (BIOTAC_ALL, BIOTAC_HAND)
@@ -74,8 +74,6 @@ class RosBagFile:
         self._library: Any = require("rosbags.highlevel", extra="gateway")
         with self._opened() as reader:
             self.dialect: Dialect = "cdr" if reader.is2 else "ros1"
-            self.start_ns = int(reader.start_time) if reader.message_count else 0
-            """When its first message was recorded [ns since the epoch]."""
             self.topics = {one.topic: str(one.msgtype) for one in reader.connections}
             """Layout of each topic."""
             self._sums = {one.topic: str(one.digest) for one in reader.connections}
@@ -115,12 +113,20 @@ class RosBagFile:
             )
         topic = topic or fitting[0]
         layout, told = self.topics[topic], self._sums[topic]
-        if self.dialect == "ros1" and told not in ("*", "", MD5[layout]):
+        if not self._is_of_this_version(topic):
             raise RecordingError(
                 f"{self.path}: {topic} has a {layout} of another version (MD5 {told})",
                 remedy=f"palpate reads the version with MD5 {MD5[layout]}; convert the bag",
             )
         return topic
+
+    def readable(self, layouts: tuple[str, ...]) -> list[str]:
+        """Topics of these layouts whose messages are of the version that palpate reads."""
+        fitting = (name for name, layout in self.topics.items() if layout in layouts)
+        return [name for name in fitting if self._is_of_this_version(name)]
+
+    def _is_of_this_version(self, topic: str) -> bool:
+        return self.dialect != "ros1" or self._sums[topic] in ("*", "", MD5[self.topics[topic]])
 
     def messages(self, topic: str) -> Iterator[BagMessage]:
         """Messages of a topic in the order of recording.
@@ -196,20 +202,20 @@ class RosBag(FileDevice):
         topic = bag.choose(options.topic, _TACTILE)
         wrench = bag.choose(options.wrench_topic, (WRENCH_STAMPED,)) if options.wrench_topic else ""
         self._track = options.track(bag.topics[topic])
-        self._track.begin(bag.start_ns)
-        self._counts = dict.fromkeys(self._counts, 0)
         first, finger = self._first(bag, topic)
-        self._counts["rejected_messages"] = 0
+        origin_ns = self._origin_ns(bag)
+        self._track.begin(origin_ns)
+        self._counts = dict.fromkeys(self._counts, 0)
         streams: list[Iterator[ElectrodeReading | WrenchReading]] = [self._fingers(bag, topic)]
         if wrench:
-            streams.append(self._wrenches(bag, wrench))
+            streams.append(self._wrenches(bag, wrench, origin_ns))
         self._deliver(heapq.merge(*streams, key=lambda reading: reading.time_s))
         kind = finger.sensor_type
         period_s = first.slot_period_s
         if not first.whole_frames:
             period_s = 1.0 / (options.rate_hz * kind.layout.slots)
         serial = options.serial or finger.serial or f"{options.path.stem}-{options.finger}"
-        return DeviceIdentity(serial, period_s, start_wall_ns=bag.start_ns, sensor_type=kind)
+        return DeviceIdentity(serial, period_s, start_wall_ns=origin_ns, sensor_type=kind)
 
     def _first(self, bag: RosBagFile, topic: str) -> tuple[RosHand, RosFinger]:
         """The first message with the finger."""
@@ -223,6 +229,22 @@ class RosBag(FileDevice):
             f"{bag.path}: {topic} has no readings of {self.info.model}",
             remedy=f"it has fingers {sorted(places) or 'none'}; correct finger or serial",
         )
+
+    def _origin_ns(self, bag: RosBagFile) -> int:
+        """The earliest first time of all topics, from which every finger of the bag counts.
+
+        The recorder's own times are later: a message comes when it is over.
+        """
+        streams: list[Iterator[RosHand | RosWrenchMessage]] = [
+            *(self._hands(bag, name) for name in bag.readable(_TACTILE)),
+            *(self._stamped(bag, name) for name in bag.readable((WRENCH_STAMPED,))),
+        ]
+        firsts_ns: list[int] = []
+        for stream in streams:
+            # Damage is an error where it is read from, not in a topic that nobody chose.
+            with contextlib.suppress(RecordingError):
+                firsts_ns += [one.time_ns for one in islice(stream, 1)]
+        return min(firsts_ns)
 
     def _hands(self, bag: RosBagFile, topic: str) -> Iterator[RosHand]:
         layout = bag.topics[topic]
@@ -246,28 +268,31 @@ class RosBag(FileDevice):
             if reading is not None:
                 yield reading
 
-    def _wrenches(self, bag: RosBagFile, topic: str) -> Iterator[WrenchReading]:
-        serial = self._options.wrench_serial or topic.strip("/").replace("/", "-")
-        last_ns = -1
+    def _stamped(self, bag: RosBagFile, topic: str) -> Iterator[RosWrenchMessage]:
         for payload, recorded_ns in bag.messages(topic):
             try:
                 message = decode_wrench(payload, bag.dialect)
             except WireError:
                 self._counts["rejected_messages"] += 1
                 continue
-            time_ns = message.time_ns or recorded_ns
+            yield message if message.time_ns else message._replace(time_ns=recorded_ns)
+
+    def _wrenches(self, bag: RosBagFile, topic: str, origin_ns: int) -> Iterator[WrenchReading]:
+        serial = self._options.wrench_serial or topic.strip("/").replace("/", "-")
+        last_ns = -1
+        for message in self._stamped(bag, topic):
             values = np.array(message.values)
             if not np.isfinite(values).all():
                 self._counts["not_finite"] += 1
                 continue
-            if time_ns <= last_ns:
+            if message.time_ns <= last_ns:
                 continue
-            last_ns = time_ns
+            last_ns = message.time_ns
             force, torque = self._mount.on_biotac(values)
             self._counts["wrenches"] += 1
             yield WrenchReading(
                 tick=self._counts["wrenches"],
-                time_s=(time_ns - bag.start_ns) * 1e-9,
+                time_s=(message.time_ns - origin_ns) * 1e-9,
                 force=force,
                 torque=torque,
                 serial=serial,

@@ -82,6 +82,21 @@ def test_the_wall_clock_is_that_of_the_recording(tmp_path: Path) -> None:
         assert started_ns + round(1e9 * first.time_s) == BEGAN_NS
 
 
+def test_all_fingers_of_a_bag_count_from_the_earliest_time_of_its_messages(tmp_path: Path) -> None:
+    """Not each from its own first, and not from when the recorder heard them."""
+    messages = [
+        (topic, BIOTAC_HAND, at_ns + 12_000_000, encode(hand_fields(k, at_ns), BIOTAC_HAND))
+        for topic, later in (("/left", 0), ("/right", 300))
+        for k in range(5)
+        for at_ns in [BEGAN_NS + PERIOD_NS * (later + k)]
+    ]
+    path = write_bag(tmp_path / "run", messages, "cdr")
+    for topic, first_s in (("/left", 0.0), ("/right", 3.0)):
+        with make_device("ros_bag", {"path": path, "topic": topic}) as device:
+            assert device.identity.start_wall_ns == BEGAN_NS
+            assert device.read(1.0)[0].time_s == pytest.approx(first_s, abs=1e-9)
+
+
 def test_the_indenter_feels_the_reaction(tmp_path: Path) -> None:
     path = make_bag(tmp_path / "a.bag", 4)
     readings, _ = readings_of(path, wrench_topic="/ft", mount={"carries": "indenter"})
