@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -29,6 +29,9 @@ _TACTILE = (BIOTAC_ALL, BIOTAC_HAND)
 
 _LOOK = 20
 """Messages that show which fingers a bag has."""
+
+_BEGAN_ANEW = 10
+"""So many messages in a row with an earlier time show that the clock of ROS was set back."""
 
 
 class RosBagOptions(RosFingerOptions):
@@ -54,11 +57,53 @@ class RosBagOptions(RosFingerOptions):
         return check_topic_name(value) if value else value
 
 
+_Decoded = TypeVar("_Decoded", RosHand, RosWrenchMessage)
+
+
 class BagMessage(NamedTuple):
     """An undecoded message of a bag: its bytes, and when it was recorded [ns since the epoch]."""
 
     payload: bytes
     recorded_ns: int
+
+
+class _Timed(NamedTuple, Generic[_Decoded]):
+    """A decoded message of a bag, when it was sampled and recorded [ns since the epoch]."""
+
+    message: _Decoded
+    time_ns: int
+    recorded_ns: int
+
+
+def _onward(
+    messages: Iterable[_Timed[_Decoded]], counts: MutableMapping[str, int]
+) -> Iterator[_Timed[_Decoded]]:
+    """Messages whose times go on where their clock was set back for good.
+
+    That is counted in ``time_jumps``. A few earlier ones among later ones stay as they are.
+    """
+    shift_ns = 0
+    last: _Timed[_Decoded] | None = None
+    earlier: list[_Timed[_Decoded]] = []
+    for told in messages:
+        one = told._replace(time_ns=told.time_ns + shift_ns)
+        if last is not None and one.time_ns < last.time_ns:
+            earlier.append(one)
+            if len(earlier) < _BEGAN_ANEW:
+                continue
+            counts["time_jumps"] += 1
+            # Only the recorder's clock spans both, also for the other topics of the bag.
+            gained_ns = max(earlier[0].recorded_ns - last.recorded_ns, 1)
+            back_ns = last.time_ns + gained_ns - earlier[0].time_ns
+            shift_ns += back_ns
+            earlier = [each._replace(time_ns=each.time_ns + back_ns) for each in earlier]
+            one = max(earlier, key=lambda each: each.time_ns)
+            yield from earlier
+        else:
+            yield from earlier
+            yield one
+        last, earlier = one, []
+    yield from earlier
 
 
 class RosBagFile:
@@ -189,7 +234,10 @@ class RosBag(FileDevice):
         self._options = options
         self._mount = Mount(options.mount)
         self._track = options.track("")
-        self._counts = {"wrenches": 0, "not_finite": 0, "rejected_messages": 0}
+        self._counts = dict.fromkeys(
+            ("wrenches", "not_finite", "rejected_messages", "repeated_wrenches", "late_wrenches",
+             "time_jumps"), 0,
+        )  # fmt: skip
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -220,7 +268,7 @@ class RosBag(FileDevice):
     def _first(self, bag: RosBagFile, topic: str) -> tuple[RosHand, RosFinger]:
         """The first message with the finger."""
         places: set[int] = set()
-        for hand in self._hands(bag, topic):
+        for hand, _, _ in self._hands(bag, topic):
             finger = self._track.find(hand)
             if finger is not None:
                 return hand, finger
@@ -235,7 +283,7 @@ class RosBag(FileDevice):
 
         The recorder's own times are later: a message comes when it is over.
         """
-        streams: list[Iterator[RosHand | RosWrenchMessage]] = [
+        streams: list[Iterator[_Timed[Any]]] = [
             *(self._hands(bag, name) for name in bag.readable(_TACTILE)),
             *(self._stamped(bag, name) for name in bag.readable((WRENCH_STAMPED,))),
         ]
@@ -246,7 +294,7 @@ class RosBag(FileDevice):
                 firsts_ns += [one.time_ns for one in islice(stream, 1)]
         return min(firsts_ns)
 
-    def _hands(self, bag: RosBagFile, topic: str) -> Iterator[RosHand]:
+    def _hands(self, bag: RosBagFile, topic: str) -> Iterator[_Timed[RosHand]]:
         layout = bag.topics[topic]
         for payload, recorded_ns in bag.messages(topic):
             try:
@@ -254,45 +302,49 @@ class RosBag(FileDevice):
             except WireError:
                 self._counts["rejected_messages"] += 1
                 continue
-            yield hand if hand.time_ns else replace(hand, time_ns=recorded_ns, end_ns=recorded_ns)
+            if not hand.time_ns:
+                hand = replace(hand, time_ns=recorded_ns, end_ns=recorded_ns)
+            yield _Timed(hand, hand.time_ns, recorded_ns)
 
     def _fingers(self, bag: RosBagFile, topic: str) -> Iterator[ElectrodeReading]:
         before: int | None = None
-        for hand in self._hands(bag, topic):
+        for hand, time_ns, _ in _onward(self._hands(bag, topic), self._counts):
             # The header of ROS 1 has a number; drivers that do not fill it leave it at 0.
             now, lost = hand.sequence, None
             if before is not None and now is not None and now > before:
                 lost = now - before - 1
             before = now
-            reading = self._track.take(hand, lost=lost)
+            reading = self._track.take(replace(hand, time_ns=time_ns), lost=lost)
             if reading is not None:
                 yield reading
 
-    def _stamped(self, bag: RosBagFile, topic: str) -> Iterator[RosWrenchMessage]:
+    def _stamped(self, bag: RosBagFile, topic: str) -> Iterator[_Timed[RosWrenchMessage]]:
         for payload, recorded_ns in bag.messages(topic):
             try:
                 message = decode_wrench(payload, bag.dialect)
             except WireError:
                 self._counts["rejected_messages"] += 1
                 continue
-            yield message if message.time_ns else message._replace(time_ns=recorded_ns)
+            yield _Timed(message, message.time_ns or recorded_ns, recorded_ns)
 
     def _wrenches(self, bag: RosBagFile, topic: str, origin_ns: int) -> Iterator[WrenchReading]:
         serial = self._options.wrench_serial or topic.strip("/").replace("/", "-")
         last_ns = -1
-        for message in self._stamped(bag, topic):
+        for message, time_ns, _ in _onward(self._stamped(bag, topic), self._counts):
             values = np.array(message.values)
             if not np.isfinite(values).all():
                 self._counts["not_finite"] += 1
                 continue
-            if message.time_ns <= last_ns:
+            if time_ns <= last_ns:
+                late = "repeated_wrenches" if time_ns == last_ns else "late_wrenches"
+                self._counts[late] += 1
                 continue
-            last_ns = message.time_ns
+            last_ns = time_ns
             force, torque = self._mount.on_biotac(values)
             self._counts["wrenches"] += 1
             yield WrenchReading(
                 tick=self._counts["wrenches"],
-                time_s=(message.time_ns - origin_ns) * 1e-9,
+                time_s=(time_ns - origin_ns) * 1e-9,
                 force=force,
                 torque=torque,
                 serial=serial,
