@@ -67,7 +67,8 @@ class ClockQuality(IntEnum):
     ARRIVAL = 0
     """The device sends no time: its stamps are times of arrival, late by every delay on the way."""
     SETTLING = 1
-    """Its clock has been followed for less than four seconds: the drift is not known yet."""
+    """Its clock has been followed for less than four seconds, and the drift is not known yet; or it
+    seems to have stopped and gone on."""
     FOLLOWED = 2
     """Its clock is followed, offset and drift."""
     ODD = 3
@@ -98,6 +99,11 @@ class ClockMap(ABC):
 
     def gauges(self) -> Mapping[str, float]:
         """Gauges of the status, none for a recording; may be called from any thread."""
+        return {}
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Counters of the status: ``clock_steps``, where a clock is followed."""
         return {}
 
 
@@ -142,7 +148,7 @@ class LiveClock(ClockMap):
     @property
     def quality(self) -> ClockQuality:
         """How good its stamps are."""
-        if self._envelope.span_s < SETTLED_S:
+        if self._envelope.span_s < SETTLED_S or self._envelope.in_doubt:
             return ClockQuality.SETTLING
         if abs(self._envelope.drift_ppm) > ODD_PPM:
             return ClockQuality.ODD
@@ -156,6 +162,11 @@ class LiveClock(ClockMap):
             gauges["clock_drift_ppm"] = self._envelope.drift_ppm
             gauges["clock_delay_p50_s"] = 1e-9 * delays_ns[len(delays_ns) // 2]
         return gauges
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """``clock_steps``: how often the device's clock has stopped and gone on."""
+        return {"clock_steps": self._envelope.steps}
 
 
 class ArrivalClock(ClockMap):

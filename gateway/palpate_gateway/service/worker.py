@@ -210,6 +210,8 @@ class SensorWorker:
         # The pipeline counts the missing frames of every device; adding Counters drops zeros.
         zeros = dict.fromkeys(self.device.counters.keys() - {"frames"}, 0)
         own = self._counters + self._publisher.counters
+        if self._clock_map is not None:
+            own += Counter(self._clock_map.counters)
         return {**zeros, **device, **own, **self.pipeline.counters}
 
     def gauges(self) -> dict[str, float]:
@@ -273,6 +275,8 @@ class SensorWorker:
             try:
                 self.device.open()
                 self._key.opened(self.device.identity.serial)
+                if self._clock_map is not None:
+                    self._counters += Counter(self._clock_map.counters)
                 self._clock_map = self._clock()
                 self.pipeline.begin(self.device.identity, self._clock_map)
                 self._calm_s, self._delivered = self._calm(), False

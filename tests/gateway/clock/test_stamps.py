@@ -66,6 +66,21 @@ def test_quality_is_told_from_the_start() -> None:
     assert odd.quality is ClockQuality.ODD
 
 
+def test_a_clock_that_stops_for_a_while_is_followed_again() -> None:
+    live, last_ns, arrival_ns = LiveClock(), 0, 0
+    for k in range(1600):
+        arrival_ns = round(1e9 * (k * FRAME_S + (20.0 if k >= 800 else 0.0))) + 10**9
+        stamp_ns = live.map(k * FRAME_S, arrival_ns).monotonic_ns
+        assert last_ns <= stamp_ns <= arrival_ns
+        last_ns = stamp_ns
+        if k in (799, 1599):
+            assert live.quality is ClockQuality.FOLLOWED
+        elif 800 <= k < 1190:
+            assert live.quality is ClockQuality.SETTLING
+    assert arrival_ns - last_ns < MS
+    assert live.counters == {"clock_steps": 1}
+
+
 Steps = list[tuple[float, int, float]]
 steps = st.lists(
     st.tuples(st.floats(0, 0.1), st.integers(0, 10**8), st.floats(0, 0.01)), min_size=1, max_size=80
