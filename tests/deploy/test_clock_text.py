@@ -41,13 +41,15 @@ def test_every_sensor_and_the_wall_clock_have_a_line() -> None:
                 "wall_synchronised": 1.0,
                 "wall_error_s": 0.0032,
             },
-            {"wall_steps": 2},
+            {"wall_steps": 2, "a.clock_steps": 1, "c.clock_steps": 3},
         )
     )
     assert lines == [
-        "clock of a: followed, 42 ppm slow, frames arrive 10.4 ms after their stamps",
+        "clock of a: followed, 42 ppm slow, frames arrive 10.4 ms after their stamps, "
+        "it stopped and went on once",
         "clock of b: the device sends none; stamps are times of arrival",
-        "clock of c: followed, 5000 ppm fast, too much for a quartz: check the configured rate",
+        "clock of c: followed, 5000 ppm fast, too much for a quartz: check the configured rate, "
+        "it stopped and went on 3 times",
         "clock of d: quality 17",
         "wall clock: synchronised to 3.2 ms, by the kernel's estimate",
         "wall clock: it was set 2 times since the start of gateway",

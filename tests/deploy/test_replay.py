@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.gateway.ros_fakes import make_bag
+from tests.gateway.ros_fakes import BEGAN_NS, hand_fields, make_bag, write_bag
 
 from palpate.bus import Session
 from palpate.bus.topics import ELECTRODES, FEATURES
 from palpate.files.record import read_record
 from palpate.messages import Status
-from palpate.ros.layouts import Dialect
+from palpate.ros.layouts import BIOTAC_HAND, Dialect, encode
 from palpate_deploy.diagnose.replay import replay, replay_profile
 from palpate_deploy.station.status import ask_status
 
@@ -86,6 +86,21 @@ def test_bag_of_ros(palpate: Palpate, bundle: str, tmp_path: Path, dialect: Dial
     account = _replay(palpate, path, tmp_path / "out", "--bundle", bundle)
     assert account["frames"] == account["recorded"]["electrodes"] == account["estimates"] == 120
     assert account["missing_frames"] == 0
+
+
+def test_messages_that_a_bag_loses_are_told(palpate: Palpate, bundle: str, tmp_path: Path) -> None:
+    late = {50: 40, 51: 41}
+    messages = [
+        ("/hand", BIOTAC_HAND, BEGAN_NS + 10_000_000 * k, encode(fields, BIOTAC_HAND))
+        for k in range(120)
+        for fields in [hand_fields(k, BEGAN_NS + 10_000_000 * late.get(k, k) - 5_000_000)]
+    ]
+    path = write_bag(tmp_path / "a", messages, "cdr")
+    result = palpate("replay", path, "--out", tmp_path / "out", "--no-rrd", "--json")
+    assert result.returncode == 1
+    assert "2 of its messages were dropped" in result.stderr
+    account = json.loads(result.stdout)
+    assert (account["frames"], account["dropped_messages"], account["lossless"]) == (118, 2, False)
 
 
 def test_real_capture(palpate: Palpate, shared_data: Path, bundle: str, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.gateway.ros_fakes import BEGAN_NS, hand_fields, write_bag
 
 from palpate.bus.topics import TOPICS
 from palpate.codec import TARE
@@ -18,6 +19,7 @@ from palpate.errors import RecordingError, RemoteError
 from palpate.files.record import read_record
 from palpate.files.record_writer import RecordWriter
 from palpate.messages import ElectrodeFrame, Origin, ServiceState
+from palpate.ros.layouts import BIOTAC_HAND, encode
 
 PATIENCE_S = 30.0
 
@@ -123,6 +125,34 @@ def test_recorded_pace_stamps_are_now(bus: Any, log: Callable[..., Any], tmp_pat
         round((b.stamp.monotonic_ns - a.stamp.monotonic_ns) / 1e6) for a, b in pairwise(frames)
     }
     assert spans == {10}
+
+
+def test_fingers_of_a_file_stay_as_far_apart_as_they_were_recorded(
+    bus: Any, tmp_path: Path
+) -> None:
+    later_ns = {"/left": 0, "/right": 300_000_000}
+    messages = [
+        (topic, BIOTAC_HAND, at_ns, encode(hand_fields(k, at_ns), BIOTAC_HAND))
+        for topic, late_ns in later_ns.items()
+        for k in range(30)
+        for at_ns in [BEGAN_NS + late_ns + 10_000_000 * k]
+    ]
+    path = write_bag(tmp_path / "run", messages, "cdr")
+    values = replay(path, pace="recorded")
+    values["sensors"] = [
+        {"name": topic[1:], "driver": "ros_bag", "options": {"path": path, "topic": topic}}
+        for topic in later_ns
+    ]
+    firsts: dict[str, ElectrodeFrame] = {}
+    with bus.consumer() as tap, bus.gateway(values):
+        while len(firsts) < 2:
+            sample = tap.next(timeout_s=PATIENCE_S)
+            if sample.topic == "electrodes":
+                frame = TOPICS[sample.topic].codec.decode(sample.payload)
+                firsts.setdefault(sample.sensor, frame)
+    left, right = firsts["left"].stamp, firsts["right"].stamp
+    assert right.monotonic_ns - left.monotonic_ns == 300_000_000
+    assert right.wall_ns - left.wall_ns == 300_000_000
 
 
 def test_truncated_log_publishes_what_it_has_then_fails(

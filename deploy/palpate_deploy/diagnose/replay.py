@@ -97,10 +97,18 @@ class ReplayAccount:
         return found
 
     @property
+    def dropped(self) -> int:
+        """Messages of the file that became no reading: too late in order, or not decodable."""
+        return sum(total(self.gateway, name) for name in _DROPPED)
+
+    @property
     def unanswered(self) -> dict[str, int]:
         """Frames that got no estimate, by the service's reason."""
         known = {"frames_received", "estimates_published", "restarts", "delivered", "received"}
         return {k: n for k, n in self.features.items() if n and k not in known}
+
+
+_DROPPED = ("late_messages", "late_wrenches", "rejected_messages")
 
 
 def total(counters: dict[str, int], name: str) -> int:
@@ -128,10 +136,11 @@ def as_plain(account: ReplayAccount) -> dict[str, Any]:
         "frames_by_sensor": account.by_sensor,
         "missing_frames": total(account.gateway, "missing_frames"),
         "time_jumps": total(account.gateway, "time_jumps"),
+        "dropped_messages": account.dropped,
         "estimates": account.estimated,
         "recorded": account.recorded,
         "records": [str(path) for path in account.records],
-        "lossless": not account.problems,
+        "lossless": not account.problems and not account.dropped,
         "gateway": account.gateway,
         "features": account.features,
         "error": None if error is None else {"problem": error.problem, "remedy": error.remedy},
@@ -146,6 +155,8 @@ def print_account(account: ReplayAccount) -> None:
     plain = as_plain(account)
     for name in ("samples", "frames", "missing_frames", "time_jumps", "estimates"):
         table.add_row(name.replace("_", " "), f"{plain[name]:,}")
+    if account.dropped:
+        table.add_row("dropped messages", f"{account.dropped:,}")
     for reason, count in sorted(account.unanswered.items()):
         table.add_row(f"  without estimate: {reason}", f"{count:,}")
     for sensor, count in account.by_sensor.items():
@@ -173,7 +184,7 @@ def run_replay(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool, as_j
     """Replay a vendor's text log or a palpate record at the pace ``fast`` or ``recorded``.
 
     Returns:
-        0; 1 if something was lost on the way; 3 if the file is damaged.
+        0; 1 if something was lost on the way or dropped from the file; 3 if the file is damaged.
 
     Raises:
         PalpateError: The replay could not be run at all.
@@ -199,6 +210,15 @@ def run_replay(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool, as_j
                     remedy="see the counters above, and report it: a replay must be lossless",
                 )
             )
+        return FAILED
+    if account.dropped:
+        print_error(
+            RecordingError(
+                f"{file}: {account.dropped} of its messages were dropped",
+                remedy="their times are earlier than those of messages before them, or their bytes "
+                "are no such message; the counters of --json tell which",
+            )
+        )
         return FAILED
     return 0
 

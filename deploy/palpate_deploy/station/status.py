@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -45,7 +45,7 @@ def clock_lines(status: Status) -> list[str]:
         if tail != _QUALITY:
             continue
         sensor = head or " ".join(status.sensors) or status.service
-        lines.append(f"clock of {sensor}: {_sensor_clock(gauges, head + dot)}")
+        lines.append(f"clock of {sensor}: {_sensor_clock(status, head + dot)}")
     if "wall_synchronised" in gauges:
         kept = WallDiscipline(gauges["wall_synchronised"] > 0.5, gauges.get("wall_error_s", 0.0))
         lines.append(f"wall clock: {wall_words(kept)}")
@@ -71,7 +71,8 @@ def duration_words(seconds: float) -> str:
     return f"{1e3 * seconds:.1f} ms" if seconds < 1.0 else f"{seconds:.1f} s"
 
 
-def _sensor_clock(gauges: Mapping[str, float], prefix: str) -> str:
+def _sensor_clock(status: Status, prefix: str) -> str:
+    gauges = status.gauges
     try:
         quality = ClockQuality(int(gauges[prefix + _QUALITY]))
     except ValueError:  # of a newer palpate
@@ -87,6 +88,8 @@ def _sensor_clock(gauges: Mapping[str, float], prefix: str) -> str:
         words.append(f"frames arrive {duration_words(delay_s)} after their stamps")
     if quality is ClockQuality.ODD:
         words.append("too much for a quartz: check the configured rate")
+    if steps := status.counters.get(prefix + "clock_steps", 0):
+        words.append(f"it stopped and went on {'once' if steps == 1 else f'{steps} times'}")
     return ", ".join(words)
 
 

@@ -43,6 +43,17 @@ _WILD_PPM = 50_000.0
 """No clock drifts by more than this [ppm]."""
 
 
+_STOPPED_NS = 5e8
+"""Readings that are later by more from one to the next on, and stay so, have not waited: the clock
+has stopped and gone on, as that of a simulation does [ns]."""
+
+_STOPPED_S = 2.0
+"""They stay so for this long, by both clocks [s]: what a stall held back comes all at once."""
+
+_STOPPED_READINGS = 5
+"""And there are so many, however rare they are."""
+
+
 class ClockEnvelope:
     """Follows one clock: a few comparisons for each reading, a small fit every 0.25 s."""
 
@@ -50,7 +61,12 @@ class ClockEnvelope:
         self._parts: deque[EnvelopePoint] = deque(maxlen=math.ceil(WINDOW_S / PART_S))
         self._lowest: EnvelopePoint = (0.0, 0.0)
         self._low_ns = math.inf  # of this part, above the line
-        self._part_ends_s = self._last_s = 0.0
+        self._part_ends_s = self._last_s = self._last_ns = 0.0
+        # Readings in a row, all too far above the line for a delay: first, lowest, how many.
+        self._far_first = self._far_lowest = (0.0, 0.0)
+        self._far = 0
+        self.steps = 0
+        """How often the clock has stopped and gone on."""
         # The line: delay(x) = base + slope * (x - at).
         self._base_ns, self._slope, self._at_s = math.inf, 0.0, 0.0
 
@@ -63,6 +79,11 @@ class ClockEnvelope:
     def span_s(self) -> float:
         """Device time that the readings of the line span [s]."""
         return self._parts[-1][0] - self._parts[0][0] if self._parts else 0.0
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether the clock seems to have stopped, and the line is not that of its readings."""
+        return self._far > 0
 
     def add(self, x_s: float, late_ns: float) -> None:
         """Take a reading.
@@ -82,13 +103,36 @@ class ClockEnvelope:
             else:
                 self._base_ns += above_ns
             self._low_ns = 0.0
-        self._last_s = x_s
+        self._watch(x_s, late_ns, above_ns)
+        self._last_s, self._last_ns = x_s, late_ns
         if x_s >= self._part_ends_s:
             self._end_part(x_s)
 
     def at(self, x_s: float) -> float:
         """Least delay at a device time [ns]."""
         return self._base_ns + self._slope * (x_s - self._at_s)
+
+    def _watch(self, x_s: float, late_ns: float, above_ns: float) -> None:
+        """Begin anew where the clock has stopped and gone on."""
+        here = x_s, late_ns
+        if above_ns <= _STOPPED_NS:
+            self._far = 0
+        elif late_ns - self._last_ns > _STOPPED_NS:
+            self._far_first, self._far_lowest, self._far = here, here, 1
+        elif self._far:  # a delay that grows from reading to reading is a queue: its line stays
+            self._far_lowest = min(self._far_lowest, here, key=lambda one: one[1])
+            self._far += 1
+            since_s = x_s - self._far_first[0]
+            arrived_s = since_s + 1e-9 * (late_ns - self._far_first[1])
+            if min(since_s, arrived_s) >= _STOPPED_S and self._far >= _STOPPED_READINGS:
+                self._begin_anew(x_s)
+
+    def _begin_anew(self, x_s: float) -> None:
+        self.steps += 1
+        self._far = 0
+        self._parts.clear()
+        self._lowest, self._low_ns, self._part_ends_s = self._far_lowest, 0.0, x_s + PART_S
+        self._base_ns, self._slope, self._at_s = self._far_lowest[1], 0.0, x_s
 
     def _end_part(self, x_s: float) -> None:
         parts = self._parts

@@ -7,8 +7,10 @@ times stay as recorded, so that the result does not depend on when it is replaye
 
 from __future__ import annotations
 
+import contextlib
 import math
 import secrets
+import threading
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -65,7 +67,8 @@ class ClockQuality(IntEnum):
     ARRIVAL = 0
     """The device sends no time: its stamps are times of arrival, late by every delay on the way."""
     SETTLING = 1
-    """Its clock has been followed for less than four seconds: the drift is not known yet."""
+    """Its clock has been followed for less than four seconds, and the drift is not known yet; or it
+    seems to have stopped and gone on."""
     FOLLOWED = 2
     """Its clock is followed, offset and drift."""
     ODD = 3
@@ -96,6 +99,11 @@ class ClockMap(ABC):
 
     def gauges(self) -> Mapping[str, float]:
         """Gauges of the status, none for a recording; may be called from any thread."""
+        return {}
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Counters of the status: ``clock_steps``, where a clock is followed."""
         return {}
 
 
@@ -140,7 +148,7 @@ class LiveClock(ClockMap):
     @property
     def quality(self) -> ClockQuality:
         """How good its stamps are."""
-        if self._envelope.span_s < SETTLED_S:
+        if self._envelope.span_s < SETTLED_S or self._envelope.in_doubt:
             return ClockQuality.SETTLING
         if abs(self._envelope.drift_ppm) > ODD_PPM:
             return ClockQuality.ODD
@@ -154,6 +162,11 @@ class LiveClock(ClockMap):
             gauges["clock_drift_ppm"] = self._envelope.drift_ppm
             gauges["clock_delay_p50_s"] = 1e-9 * delays_ns[len(delays_ns) // 2]
         return gauges
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """``clock_steps``: how often the device's clock has stopped and gone on."""
+        return {"clock_steps": self._envelope.steps}
 
 
 class ArrivalClock(ClockMap):
@@ -176,49 +189,95 @@ class ArrivalClock(ClockMap):
 
 
 class _RecordedClock(ClockMap):
-    """Shared by both maps of recordings: device time since the first reading.
+    """Shared by both maps of recordings: device time that never steps back.
 
-    Recorded times can step back, where a log was joined from several; time then stands still.
+    Recorded times can, where a log was joined from several; time then stands still.
     """
 
     def __init__(self) -> None:
-        self._shift_s: float | None = None
-        self._last_s = 0.0
+        self._shift_s = 0.0
+        self._last_s = -math.inf
 
-    def _elapsed_ns(self, time_s: float) -> int:
-        if self._shift_s is None:
-            self._shift_s = -time_s
+    def _steady_s(self, time_s: float) -> float:
         if time_s + self._shift_s < self._last_s:
             self._shift_s = self._last_s - time_s
         self._last_s = time_s + self._shift_s
-        return round(self._last_s * 1e9)
+        return self._last_s
+
+
+_MEET_S = 10.0
+"""How long the sensors of a file wait for one another; opening a long one takes seconds [s]."""
+
+
+class PacedStart:
+    """The begin of a file that is replayed at its own pace: its earliest reading is now.
+
+    The sensors of one file share it, so that they stay as far apart as they were recorded.
+
+    Args:
+        sensors: How many read the file, each in a thread of its own.
+    """
+
+    def __init__(self, sensors: int = 1) -> None:
+        self._lock = threading.Lock()
+        self._first_s: list[float] = []
+        self._began: tuple[float, HostTime] | None = None
+        self._all_here = threading.Barrier(sensors, timeout=_MEET_S)
+
+    def meet(self, time_s: float) -> tuple[float, HostTime]:
+        """Wait for the first readings of the others: device time of the earliest [s], and now.
+
+        Args:
+            time_s: Device time of this sensor's first reading [s].
+        """
+        with self._lock:
+            self._first_s.append(time_s)
+        # One that cannot be opened must not keep the others.
+        with contextlib.suppress(threading.BrokenBarrierError):
+            self._all_here.wait()
+        with self._lock:
+            if self._began is None:
+                self._began = min(self._first_s), HostTime(*clock.now())
+            return self._began
+
+    def leave(self) -> None:
+        """A sensor has ended: nobody waits for it."""
+        self._all_here.abort()
 
 
 class PacedClock(_RecordedClock):
-    """A recording at its own pace: its first reading is now."""
+    """A recording at its own pace: its first reading is now.
+
+    Args:
+        start: Shared by the sensors of one file; None = this one is alone.
+    """
 
     paced = True
 
-    def __init__(self) -> None:
+    def __init__(self, start: PacedStart | None = None) -> None:
         super().__init__()
-        self._start: HostTime | None = None
+        self._start = start or PacedStart()
+        self._began: tuple[float, HostTime] | None = None
 
     def map(
         self, time_s: float, arrival_ns: int, observed: ClockObservation | None = None
     ) -> HostTime:
         """See ``ClockMap``."""
-        if self._start is None:
-            self._start = HostTime(*clock.now())
-        elapsed_ns = self._elapsed_ns(time_s)
-        return HostTime(self._start.monotonic_ns + elapsed_ns, self._start.wall_ns + elapsed_ns)
+        if self._began is None:
+            self._began = self._start.meet(time_s)
+        first_s, now = self._began
+        elapsed_ns = round((self._steady_s(time_s) - first_s) * 1e9)
+        return HostTime(now.monotonic_ns + elapsed_ns, now.wall_ns + elapsed_ns)
 
 
 class FileClock(_RecordedClock):
     """A recording as fast as possible: times as recorded.
 
+    Monotonic times are device times, so that the sensors of one file can be compared.
+
     Args:
         serial: Serial number of the sensor, which makes the clock's id.
-        start_wall_ns: Wall clock at the first reading [ns]; None = not recorded, then the Unix
+        start_wall_ns: Wall clock at device time zero [ns]; None = not recorded, then the Unix
             epoch.
     """
 
@@ -227,6 +286,7 @@ class FileClock(_RecordedClock):
     def __init__(self, serial: str, start_wall_ns: int | None) -> None:
         super().__init__()
         self._start_wall_ns = start_wall_ns or 0
+        self._lift_ns: int | None = None
         # Never this host's id: an age computed from these times would mean nothing.
         named = zlib.crc32(f"file:{serial}:{self._start_wall_ns}".encode()) or 1
         self.clock_id = named if named != clock.CLOCK_ID else named ^ 1
@@ -235,8 +295,14 @@ class FileClock(_RecordedClock):
         self, time_s: float, arrival_ns: int, observed: ClockObservation | None = None
     ) -> HostTime:
         """See ``ClockMap``."""
-        elapsed_ns = self._elapsed_ns(time_s)
-        return HostTime(elapsed_ns, self._start_wall_ns + elapsed_ns)
+        device_ns = round(self._steady_s(time_s) * 1e9)
+        if self._lift_ns is None:
+            # A stamp cannot be negative; the times of a device may be.
+            self._lift_ns = max(-device_ns, 0)
+        monotonic_ns = device_ns + self._lift_ns
+        if not self._start_wall_ns:
+            return HostTime(monotonic_ns, monotonic_ns)
+        return HostTime(monotonic_ns, self._start_wall_ns + device_ns)
 
 
 @dataclass(frozen=True, slots=True)

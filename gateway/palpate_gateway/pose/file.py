@@ -172,8 +172,14 @@ class PoseFile(FileDevice):
             source.close()
 
     def _poses(self, rows: Iterable[PoseRow]) -> Iterator[PoseReading]:
+        began_s: float | None = None
         for row in rows:
+            if began_s is None:
+                began_s = row.time_s  # time zero: the wall clock is known at the first pose
             self._samples += 1
             yield self._placement.reading(
-                row.pose, tick=row.tick, time_s=row.time_s, missed_before=row.missed_before
+                row.pose,
+                tick=row.tick,
+                time_s=row.time_s - began_s,
+                missed_before=row.missed_before,
             )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -22,13 +22,16 @@ from palpate_gateway.device import DeviceIdentity, FileDevice
 from palpate_gateway.protocols.ros_hands import RosFinger, RosHand, decode_hand
 from palpate_gateway.readings import ElectrodeReading, WrenchReading
 from palpate_gateway.ros.biotac import RosFingerOptions
-from palpate_gateway.ros.wrench import decode_wrench
+from palpate_gateway.ros.wrench import RosWrenchMessage, decode_wrench
 from palpate_gateway.wrench.device import Mount, MountOptions
 
 _TACTILE = (BIOTAC_ALL, BIOTAC_HAND)
 
 _LOOK = 20
 """Messages that show which fingers a bag has."""
+
+_BEGAN_ANEW = 10
+"""So many messages in a row with an earlier time show that the clock of ROS was set back."""
 
 
 class RosBagOptions(RosFingerOptions):
@@ -54,11 +57,53 @@ class RosBagOptions(RosFingerOptions):
         return check_topic_name(value) if value else value
 
 
+_Decoded = TypeVar("_Decoded", RosHand, RosWrenchMessage)
+
+
 class BagMessage(NamedTuple):
     """An undecoded message of a bag: its bytes, and when it was recorded [ns since the epoch]."""
 
     payload: bytes
     recorded_ns: int
+
+
+class _Timed(NamedTuple, Generic[_Decoded]):
+    """A decoded message of a bag, when it was sampled and recorded [ns since the epoch]."""
+
+    message: _Decoded
+    time_ns: int
+    recorded_ns: int
+
+
+def _onward(
+    messages: Iterable[_Timed[_Decoded]], counts: MutableMapping[str, int]
+) -> Iterator[_Timed[_Decoded]]:
+    """Messages whose times go on where their clock was set back for good.
+
+    That is counted in ``time_jumps``. A few earlier ones among later ones stay as they are.
+    """
+    shift_ns = 0
+    last: _Timed[_Decoded] | None = None
+    earlier: list[_Timed[_Decoded]] = []
+    for told in messages:
+        one = told._replace(time_ns=told.time_ns + shift_ns)
+        if last is not None and one.time_ns < last.time_ns:
+            earlier.append(one)
+            if len(earlier) < _BEGAN_ANEW:
+                continue
+            counts["time_jumps"] += 1
+            # Only the recorder's clock spans both, also for the other topics of the bag.
+            gained_ns = max(earlier[0].recorded_ns - last.recorded_ns, 1)
+            back_ns = last.time_ns + gained_ns - earlier[0].time_ns
+            shift_ns += back_ns
+            earlier = [each._replace(time_ns=each.time_ns + back_ns) for each in earlier]
+            one = max(earlier, key=lambda each: each.time_ns)
+            yield from earlier
+        else:
+            yield from earlier
+            yield one
+        last, earlier = one, []
+    yield from earlier
 
 
 class RosBagFile:
@@ -74,8 +119,6 @@ class RosBagFile:
         self._library: Any = require("rosbags.highlevel", extra="gateway")
         with self._opened() as reader:
             self.dialect: Dialect = "cdr" if reader.is2 else "ros1"
-            self.start_ns = int(reader.start_time) if reader.message_count else 0
-            """When its first message was recorded [ns since the epoch]."""
             self.topics = {one.topic: str(one.msgtype) for one in reader.connections}
             """Layout of each topic."""
             self._sums = {one.topic: str(one.digest) for one in reader.connections}
@@ -115,12 +158,20 @@ class RosBagFile:
             )
         topic = topic or fitting[0]
         layout, told = self.topics[topic], self._sums[topic]
-        if self.dialect == "ros1" and told not in ("*", "", MD5[layout]):
+        if not self._is_of_this_version(topic):
             raise RecordingError(
                 f"{self.path}: {topic} has a {layout} of another version (MD5 {told})",
                 remedy=f"palpate reads the version with MD5 {MD5[layout]}; convert the bag",
             )
         return topic
+
+    def readable(self, layouts: tuple[str, ...]) -> list[str]:
+        """Topics of these layouts whose messages are of the version that palpate reads."""
+        fitting = (name for name, layout in self.topics.items() if layout in layouts)
+        return [name for name in fitting if self._is_of_this_version(name)]
+
+    def _is_of_this_version(self, topic: str) -> bool:
+        return self.dialect != "ros1" or self._sums[topic] in ("*", "", MD5[self.topics[topic]])
 
     def messages(self, topic: str) -> Iterator[BagMessage]:
         """Messages of a topic in the order of recording.
@@ -183,7 +234,10 @@ class RosBag(FileDevice):
         self._options = options
         self._mount = Mount(options.mount)
         self._track = options.track("")
-        self._counts = {"wrenches": 0, "not_finite": 0, "rejected_messages": 0}
+        self._counts = dict.fromkeys(
+            ("wrenches", "not_finite", "rejected_messages", "repeated_wrenches", "late_wrenches",
+             "time_jumps"), 0,
+        )  # fmt: skip
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -196,25 +250,25 @@ class RosBag(FileDevice):
         topic = bag.choose(options.topic, _TACTILE)
         wrench = bag.choose(options.wrench_topic, (WRENCH_STAMPED,)) if options.wrench_topic else ""
         self._track = options.track(bag.topics[topic])
-        self._track.begin(bag.start_ns)
-        self._counts = dict.fromkeys(self._counts, 0)
         first, finger = self._first(bag, topic)
-        self._counts["rejected_messages"] = 0
+        origin_ns = self._origin_ns(bag)
+        self._track.begin(origin_ns)
+        self._counts = dict.fromkeys(self._counts, 0)
         streams: list[Iterator[ElectrodeReading | WrenchReading]] = [self._fingers(bag, topic)]
         if wrench:
-            streams.append(self._wrenches(bag, wrench))
+            streams.append(self._wrenches(bag, wrench, origin_ns))
         self._deliver(heapq.merge(*streams, key=lambda reading: reading.time_s))
         kind = finger.sensor_type
         period_s = first.slot_period_s
         if not first.whole_frames:
             period_s = 1.0 / (options.rate_hz * kind.layout.slots)
         serial = options.serial or finger.serial or f"{options.path.stem}-{options.finger}"
-        return DeviceIdentity(serial, period_s, start_wall_ns=bag.start_ns, sensor_type=kind)
+        return DeviceIdentity(serial, period_s, start_wall_ns=origin_ns, sensor_type=kind)
 
     def _first(self, bag: RosBagFile, topic: str) -> tuple[RosHand, RosFinger]:
         """The first message with the finger."""
         places: set[int] = set()
-        for hand in self._hands(bag, topic):
+        for hand, _, _ in self._hands(bag, topic):
             finger = self._track.find(hand)
             if finger is not None:
                 return hand, finger
@@ -224,7 +278,23 @@ class RosBag(FileDevice):
             remedy=f"it has fingers {sorted(places) or 'none'}; correct finger or serial",
         )
 
-    def _hands(self, bag: RosBagFile, topic: str) -> Iterator[RosHand]:
+    def _origin_ns(self, bag: RosBagFile) -> int:
+        """The earliest first time of all topics, from which every finger of the bag counts.
+
+        The recorder's own times are later: a message comes when it is over.
+        """
+        streams: list[Iterator[_Timed[Any]]] = [
+            *(self._hands(bag, name) for name in bag.readable(_TACTILE)),
+            *(self._stamped(bag, name) for name in bag.readable((WRENCH_STAMPED,))),
+        ]
+        firsts_ns: list[int] = []
+        for stream in streams:
+            # Damage is an error where it is read from, not in a topic that nobody chose.
+            with contextlib.suppress(RecordingError):
+                firsts_ns += [one.time_ns for one in islice(stream, 1)]
+        return min(firsts_ns)
+
+    def _hands(self, bag: RosBagFile, topic: str) -> Iterator[_Timed[RosHand]]:
         layout = bag.topics[topic]
         for payload, recorded_ns in bag.messages(topic):
             try:
@@ -232,42 +302,49 @@ class RosBag(FileDevice):
             except WireError:
                 self._counts["rejected_messages"] += 1
                 continue
-            yield hand if hand.time_ns else replace(hand, time_ns=recorded_ns, end_ns=recorded_ns)
+            if not hand.time_ns:
+                hand = replace(hand, time_ns=recorded_ns, end_ns=recorded_ns)
+            yield _Timed(hand, hand.time_ns, recorded_ns)
 
     def _fingers(self, bag: RosBagFile, topic: str) -> Iterator[ElectrodeReading]:
         before: int | None = None
-        for hand in self._hands(bag, topic):
+        for hand, time_ns, _ in _onward(self._hands(bag, topic), self._counts):
             # The header of ROS 1 has a number; drivers that do not fill it leave it at 0.
             now, lost = hand.sequence, None
             if before is not None and now is not None and now > before:
                 lost = now - before - 1
             before = now
-            reading = self._track.take(hand, lost=lost)
+            reading = self._track.take(replace(hand, time_ns=time_ns), lost=lost)
             if reading is not None:
                 yield reading
 
-    def _wrenches(self, bag: RosBagFile, topic: str) -> Iterator[WrenchReading]:
-        serial = self._options.wrench_serial or topic.strip("/").replace("/", "-")
-        last_ns = -1
+    def _stamped(self, bag: RosBagFile, topic: str) -> Iterator[_Timed[RosWrenchMessage]]:
         for payload, recorded_ns in bag.messages(topic):
             try:
                 message = decode_wrench(payload, bag.dialect)
             except WireError:
                 self._counts["rejected_messages"] += 1
                 continue
-            time_ns = message.time_ns or recorded_ns
+            yield _Timed(message, message.time_ns or recorded_ns, recorded_ns)
+
+    def _wrenches(self, bag: RosBagFile, topic: str, origin_ns: int) -> Iterator[WrenchReading]:
+        serial = self._options.wrench_serial or topic.strip("/").replace("/", "-")
+        last_ns = -1
+        for message, time_ns, _ in _onward(self._stamped(bag, topic), self._counts):
             values = np.array(message.values)
             if not np.isfinite(values).all():
                 self._counts["not_finite"] += 1
                 continue
             if time_ns <= last_ns:
+                late = "repeated_wrenches" if time_ns == last_ns else "late_wrenches"
+                self._counts[late] += 1
                 continue
             last_ns = time_ns
             force, torque = self._mount.on_biotac(values)
             self._counts["wrenches"] += 1
             yield WrenchReading(
                 tick=self._counts["wrenches"],
-                time_s=(time_ns - bag.start_ns) * 1e-9,
+                time_s=(time_ns - origin_ns) * 1e-9,
                 force=force,
                 torque=torque,
                 serial=serial,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 
@@ -16,7 +17,7 @@ from palpate.health import Health, HealthReporter
 from palpate.heartbeat import LIMIT_S, beat
 from palpate.messages import ServiceState
 from palpate.process import avoid_pauses
-from palpate_gateway.clock.stamps import new_session_id
+from palpate_gateway.clock.stamps import PacedStart, new_session_id
 from palpate_gateway.clock.wall_clock import WallClock, wall_discipline
 from palpate_gateway.condition.condition import RetareRules
 from palpate_gateway.condition.stillness import StillLimits
@@ -74,6 +75,8 @@ def run(
     health.set_sensors(tuple(sensor.name for sensor in config.sensors))
     with Session.open(link, station=station) as session:
         workers: list[SensorWorker] = []
+        readers = Counter(_source(sensor) for sensor in config.sensors)
+        starts = {source: PacedStart(sensors) for source, sensors in readers.items()}
         fingers = sum(device.info.sensor_type is not None for device in devices)
         claims = session.claims(session_id=session_id, instance=instance, lease_s=link.lease_s)
         for sensor, device in zip(config.sensors, devices, strict=True):
@@ -94,6 +97,7 @@ def run(
                 wall=wall,
                 key=key,
                 fingers=fingers,
+                start=starts[_source(sensor)],
             )
             workers.append(worker)
             answer = partial(session.stream_queryable, sensor=sensor.name)
@@ -133,6 +137,12 @@ def _device(sensor: SensorConfig) -> Device:
             remedy="`of` is for force/torque sensors and poses of the indenter: leave it out",
         )
     return device
+
+
+def _source(sensor: SensorConfig) -> tuple[str, str]:
+    """What the sensors of one file have in common; a device has no path."""
+    path = sensor.options.get("path")
+    return sensor.driver, sensor.name if path is None else str(path)
 
 
 def _pipeline(config: GatewayConfig, sensor: str, device: Device, session_id: int) -> Pipeline:

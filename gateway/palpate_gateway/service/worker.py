@@ -26,7 +26,14 @@ from palpate.errors import (
 from palpate.health import Health
 from palpate.heartbeat import Turns
 from palpate.messages import NO_TARE, Tare, TareRequest, WrenchZero, WrenchZeroRequest
-from palpate_gateway.clock.stamps import ArrivalClock, ClockMap, FileClock, LiveClock, PacedClock
+from palpate_gateway.clock.stamps import (
+    ArrivalClock,
+    ClockMap,
+    FileClock,
+    LiveClock,
+    PacedClock,
+    PacedStart,
+)
 from palpate_gateway.clock.wall_clock import WallClock
 from palpate_gateway.device import Device
 from palpate_gateway.readings import Reading
@@ -126,6 +133,7 @@ class SensorWorker:
         wall: The wall clock of the process; None = a new one.
         key: The key under which it publishes; None = nobody else can.
         fingers: How many tactile sensors the process reads, all together.
+        start: Of a recording at its pace, shared by the sensors of its file; None = it is alone.
     """
 
     def __init__(
@@ -141,9 +149,11 @@ class SensorWorker:
         wall: WallClock | None = None,
         key: SensorKey | None = None,
         fingers: int = 1,
+        start: PacedStart | None = None,
     ) -> None:
         self.name = name
         self.device = device
+        self._start = start or PacedStart()
         self.pipeline = pipeline
         self.error: PalpateError | None = None
         """Why a recording ended early."""
@@ -200,6 +210,8 @@ class SensorWorker:
         # The pipeline counts the missing frames of every device; adding Counters drops zeros.
         zeros = dict.fromkeys(self.device.counters.keys() - {"frames"}, 0)
         own = self._counters + self._publisher.counters
+        if self._clock_map is not None:
+            own += Counter(self._clock_map.counters)
         return {**zeros, **device, **own, **self.pipeline.counters}
 
     def gauges(self) -> dict[str, float]:
@@ -247,6 +259,7 @@ class SensorWorker:
             self.crash = error
         finally:
             self.serving = False
+            self._start.leave()
             self._give_up("the sensor has ended")
             self._turns.next(LATE_S)
             self.device.close()
@@ -262,6 +275,8 @@ class SensorWorker:
             try:
                 self.device.open()
                 self._key.opened(self.device.identity.serial)
+                if self._clock_map is not None:
+                    self._counters += Counter(self._clock_map.counters)
                 self._clock_map = self._clock()
                 self.pipeline.begin(self.device.identity, self._clock_map)
                 self._calm_s, self._delivered = self._calm(), False
@@ -296,7 +311,7 @@ class SensorWorker:
         if self.device.info.live:
             return (LiveClock if identity.has_clock else ArrivalClock)(self._wall)
         if self._pace == "recorded":
-            return PacedClock()
+            return PacedClock(self._start)
         return FileClock(identity.serial, identity.start_wall_ns)
 
     def _pump(self) -> bool:

@@ -118,7 +118,7 @@ class CounterClock:
         self._rate_hz, self._name = rate_hz, name
         self._last: tuple[int, float] | None = None
         self._first: tuple[int, float] | None = None
-        self._suspect_hz = 0.0
+        self._suspect_hz: float | None = None
 
     def follow(self, raw: int, arrival_s: float, *, new_epoch: bool) -> float | None:
         """The device's time [s]; None if the rate is unknown.
@@ -158,12 +158,13 @@ class CounterClock:
 
     def _check_rate(self, measured_hz: float, rate_hz: float) -> None:
         if abs(measured_hz / rate_hz - 1.0) <= _TOLERANCE:
-            self._suspect_hz = 0.0
+            self._suspect_hz = None
             return
         # A pause of this process looks like a slow counter and then like a fast one, so one wrong
         # measurement is not enough.
-        again = abs(self._suspect_hz / measured_hz - 1.0) <= _TOLERANCE if measured_hz else False
-        self._suspect_hz = measured_hz
+        before_hz, self._suspect_hz = self._suspect_hz, measured_hz
+        # A counter that stands still has a rate, too: 0.
+        again = before_hz is not None and math.isclose(before_hz, measured_hz, rel_tol=_TOLERANCE)
         if again:
             self.wrong = True
             raise DeviceLost(

@@ -180,3 +180,42 @@ def test_a_clock_that_is_counted_wrong_is_followed_from_there_on() -> None:
     assert worst[-1] < 2e6
     assert worst[-40] < 0.3e6
     assert envelope.drift_ppm == pytest.approx(80.0, abs=30.0)
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 100.0])
+@pytest.mark.parametrize("before_s", [3.0, 30.0])
+def test_a_clock_that_stopped_is_followed_anew(rate_hz: float, before_s: float) -> None:
+    random, envelope = np.random.default_rng(5), ClockEnvelope()
+    errors, doubts = [], []
+    for k in range(round((before_s + 20.0) * rate_hz)):
+        x_s = k / rate_hz
+        truth_ns = -200e3 * x_s + (30e9 if x_s >= before_s else 0.0)
+        envelope.add(x_s, truth_ns + random.exponential(0.3e6))
+        errors.append(envelope.at(x_s) - truth_ns)
+        doubts.append(envelope.in_doubt)
+    stopped = round(before_s * rate_hz)
+    anew = stopped + doubts[stopped:].index(False)
+    assert not any(doubts[:stopped] + doubts[anew:])
+    assert anew / rate_hz - before_s <= max(2.1, 5.0 / rate_hz)
+    assert np.abs(errors[anew:]).max() < 2e6
+    assert envelope.steps == 1
+
+
+def late_from_ten_to_twenty_s(late_ns: Callable[[float], float]) -> ClockEnvelope:
+    envelope = ClockEnvelope()
+    for k in range(2000):
+        x_s = 0.01 * k
+        envelope.add(x_s, late_ns(x_s) if x_s >= 10.0 else 0.0)
+    return envelope
+
+
+def test_what_has_waited_is_no_clock_that_stopped() -> None:
+    # A stall of five seconds: all comes at its end.
+    stall = late_from_ten_to_twenty_s(lambda x_s: max(15.0 - x_s, 0.0) * 1e9)
+    # Every tenth reading comes in time.
+    bursts = late_from_ten_to_twenty_s(lambda x_s: 3e9 if round(100 * x_s) % 10 else 0.0)
+    # A queue that grows.
+    queue = late_from_ten_to_twenty_s(lambda x_s: 0.2e9 * (x_s - 10.0))
+    for envelope in (stall, bursts, queue):
+        assert envelope.steps == 0
+    assert stall.at(20.0) == bursts.at(20.0) == pytest.approx(0.0, abs=1e5)

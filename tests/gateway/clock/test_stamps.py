@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,6 +16,7 @@ from palpate_gateway.clock.stamps import (
     FileClock,
     LiveClock,
     PacedClock,
+    PacedStart,
 )
 from palpate_gateway.clock.wall_clock import LOOK_NS, ClockPair, WallClock
 from palpate_gateway.readings import ClockObservation
@@ -61,6 +64,21 @@ def test_quality_is_told_from_the_start() -> None:
     assert live.quality is ClockQuality.SETTLING
     play(odd := LiveClock(), seconds=20.0, fast_ppm=3000.0)
     assert odd.quality is ClockQuality.ODD
+
+
+def test_a_clock_that_stops_for_a_while_is_followed_again() -> None:
+    live, last_ns, arrival_ns = LiveClock(), 0, 0
+    for k in range(1600):
+        arrival_ns = round(1e9 * (k * FRAME_S + (20.0 if k >= 800 else 0.0))) + 10**9
+        stamp_ns = live.map(k * FRAME_S, arrival_ns).monotonic_ns
+        assert last_ns <= stamp_ns <= arrival_ns
+        last_ns = stamp_ns
+        if k in (799, 1599):
+            assert live.quality is ClockQuality.FOLLOWED
+        elif 800 <= k < 1190:
+            assert live.quality is ClockQuality.SETTLING
+    assert arrival_ns - last_ns < MS
+    assert live.counters == {"clock_steps": 1}
 
 
 Steps = list[tuple[float, int, float]]
@@ -133,14 +151,45 @@ def test_file_clock_keeps_the_recorded_times() -> None:
     assert file.map(71.086, 6) == (71_086_000_000, start + 71_086_000_000)
     assert file.clock_id not in (0, clock.CLOCK_ID)
     assert file.clock_id == FileClock("BT1", start).clock_id
-    assert FileClock("BT1", None).map(3.0, 0) == (0, 0)
+    assert FileClock("BT1", None).map(3.0, 0) == (3_000_000_000, 3_000_000_000)
+
+
+def test_a_file_that_begins_later_than_its_clock_keeps_its_times() -> None:
+    start = 1_594_741_080_000_000_000
+    cut = FileClock("BT2", start)
+    assert cut.map(30.035, 0) == (30_035_000_000, start + 30_035_000_000)
+    # A stamp cannot be negative; the wall time is right all the same.
+    early = FileClock("BT3", start)
+    assert early.map(-0.5, 0) == (0, start - 500_000_000)
+    assert early.map(0.25, 0) == (750_000_000, start + 250_000_000)
+    assert FileClock("BT3", None).map(-0.5, 0) == (0, 0)
+
+
+def test_the_sensors_of_a_file_start_together_at_its_pace() -> None:
+    start, first_s = PacedStart(2), {"early": 5.0, "late": 8.0}
+    with ThreadPoolExecutor() as pool:
+        clocks = {name: PacedClock(start) for name in first_s}
+        begun = {name: pool.submit(clocks[name].map, first_s[name], 0) for name in first_s}
+        early, late = (begun[name].result(timeout=30.0) for name in first_s)
+    assert late.monotonic_ns - early.monotonic_ns == 3_000_000_000
+    assert late.wall_ns - early.wall_ns == 3_000_000_000
+    assert early.monotonic_ns <= clock.now()[0]
+    assert clocks["early"].map(8.0, 0) == late
+
+
+def test_a_sensor_that_cannot_be_opened_does_not_keep_the_others_of_its_file() -> None:
+    start = PacedStart(2)
+    with ThreadPoolExecutor() as pool:
+        waiting = pool.submit(PacedClock(start).map, 5.0, 0)
+        start.leave()
+        assert waiting.result(timeout=30.0).monotonic_ns <= clock.now()[0]
 
 
 def test_time_that_steps_back_stands_still() -> None:
     file = FileClock("BT1", None)
     assert [file.map(t, 0).monotonic_ns for t in (1.0, 2.0, 0.5, 1.5)] == [
-        0,
-        1_000_000_000,
         1_000_000_000,
         2_000_000_000,
+        2_000_000_000,
+        3_000_000_000,
     ]

@@ -50,7 +50,7 @@ def test_a_table_becomes_the_tip(tmp_path: Path) -> None:
         np.testing.assert_allclose(reading.position, tip.position, atol=fakes.NEAR)
         same = float(reading.orientation @ tip.orientation)
         assert abs(abs(same) - 1.0) < fakes.NEAR  # either sign is the same rotation
-        assert reading.time_s == pytest.approx(0.004 * number, abs=1e-12)
+        assert reading.time_s == pytest.approx(0.004 * (number - 1), abs=1e-12)
         assert reading.tick == number - 1
         assert reading.in_contact is None
 
@@ -75,6 +75,7 @@ def test_wall_clock_of_the_start(tmp_path: Path) -> None:
     path = fakes.write_csv(tmp_path / "a.csv", lines)
     with device_of(path) as device:
         assert device.identity.start_wall_ns == 10**18 + 1
+        assert device.read(0.1)[0].time_s == 0.0, "the wall clock of the first row is time zero's"
     with device_of(path, start_wall_ns=5) as device:
         assert device.identity.start_wall_ns == 5
 

@@ -15,12 +15,13 @@ from tests.gateway.ros_fakes import (
     electrodes_of,
     hand_fields,
     make_bag,
+    wrench_fields,
     write_bag,
 )
 
 from palpate.errors import ConfigError, RecordingError
 from palpate.messages import Origin
-from palpate.ros.layouts import BIOTAC_ALL, BIOTAC_HAND, Dialect, encode
+from palpate.ros.layouts import BIOTAC_ALL, BIOTAC_HAND, WRENCH_STAMPED, Dialect, encode
 from palpate_gateway.drivers import make_device
 from palpate_gateway.readings import ElectrodeReading, WrenchReading
 
@@ -80,6 +81,62 @@ def test_the_wall_clock_is_that_of_the_recording(tmp_path: Path) -> None:
         first = device.read(1.0)[0]
         assert not isinstance(first, str)
         assert started_ns + round(1e9 * first.time_s) == BEGAN_NS
+
+
+def test_all_fingers_of_a_bag_count_from_the_earliest_time_of_its_messages(tmp_path: Path) -> None:
+    """Not each from its own first, and not from when the recorder heard them."""
+    messages = [
+        (topic, BIOTAC_HAND, at_ns + 12_000_000, encode(hand_fields(k, at_ns), BIOTAC_HAND))
+        for topic, later in (("/left", 0), ("/right", 300))
+        for k in range(5)
+        for at_ns in [BEGAN_NS + PERIOD_NS * (later + k)]
+    ]
+    path = write_bag(tmp_path / "run", messages, "cdr")
+    for topic, first_s in (("/left", 0.0), ("/right", 3.0)):
+        with make_device("ros_bag", {"path": path, "topic": topic}) as device:
+            assert device.identity.start_wall_ns == BEGAN_NS
+            assert device.read(1.0)[0].time_s == pytest.approx(first_s, abs=1e-9)
+
+
+def bag_with_times(path: Path, dialect: Dialect, after_s: Sequence[float]) -> Path:
+    """A finger and its wrench, recorded each 10 ms, with these times in their headers."""
+    messages = []
+    for k, since_s in enumerate(after_s):
+        at_ns, recorded_ns = BEGAN_NS + round(1e9 * since_s), BEGAN_NS + PERIOD_NS * k
+        hand = encode(hand_fields(k, at_ns, dialect), BIOTAC_HAND, dialect)
+        wrench = encode(wrench_fields(k, at_ns + 3_000_000, dialect), WRENCH_STAMPED, dialect)
+        messages.append(("/hand", BIOTAC_HAND, recorded_ns, hand))
+        messages.append(("/ft", WRENCH_STAMPED, recorded_ns, wrench))
+    return write_bag(path, messages, dialect)
+
+
+@pytest.mark.parametrize("dialect", ["ros1", "cdr"])
+def test_a_clock_that_was_set_back_loses_nothing(tmp_path: Path, dialect: Dialect) -> None:
+    times_s = [0.01 * k - (0.15 if k >= 30 else 0.0) for k in range(60)]
+    path = bag_with_times(tmp_path / ("a.bag" if dialect == "ros1" else "a"), dialect, times_s)
+    readings, counters = readings_of(path, wrench_topic="/ft")
+    took = fingers(readings)
+    # As far apart as they were recorded, and the wrench where it was.
+    assert [one.time_s for one in took] == pytest.approx([0.01 * k for k in range(60)], abs=1e-6)
+    assert [one.electrodes[0] for one in took] == [electrodes_of(k)[0] + 7 for k in range(60)]
+    wrenches = [one for one in readings if isinstance(one, WrenchReading)]
+    assert [one.force[2] for one in wrenches] == list(range(60))
+    later_s = [one.time_s - finger.time_s for one, finger in zip(wrenches, took, strict=True)]
+    assert later_s == pytest.approx([0.003] * 60, abs=1e-6)
+    assert counters["time_jumps"] == 2  # of both topics
+    assert counters["late_messages"] == counters["late_wrenches"] == 0
+    assert counters["missing_readings"] == 0
+
+
+def test_a_few_late_messages_are_dropped_and_counted(tmp_path: Path) -> None:
+    times_s = [0.01 * k for k in range(20)]
+    times_s[7], times_s[12] = 0.045, 0.11
+    path = bag_with_times(tmp_path / "a", "cdr", times_s)
+    readings, counters = readings_of(path, wrench_topic="/ft")
+    assert len(fingers(readings)) == counters["wrenches"] == 18
+    assert counters["late_messages"] == counters["late_wrenches"] == 1
+    assert counters["repeated_messages"] == counters["repeated_wrenches"] == 1
+    assert counters["time_jumps"] == 0
 
 
 def test_the_indenter_feels_the_reaction(tmp_path: Path) -> None:

@@ -28,13 +28,14 @@ def test_a_gap_that_is_longer_than_the_counter_says_is_a_restart(raw: int, lost:
         assert clock.follow(raw, 7.0, new_epoch=True) == 12.0
 
 
-def test_a_wrong_rate_is_found() -> None:
+@pytest.mark.parametrize("rate_hz", [7912, 0])
+def test_a_wrong_rate_is_found(rate_hz: int) -> None:
     clock = CounterClock(7000.0, "it")
     for k in range(2):
-        clock.follow(round(7912 * k * CHECK_S), k * CHECK_S, new_epoch=False)
+        clock.follow(round(rate_hz * k * CHECK_S), k * CHECK_S, new_epoch=False)
     assert not clock.wrong
-    with pytest.raises(DeviceLost, match="runs at 7912 Hz, not 7000 Hz"):
-        clock.follow(round(7912 * 2 * CHECK_S), 2 * CHECK_S, new_epoch=False)
+    with pytest.raises(DeviceLost, match=f"runs at {rate_hz} Hz, not 7000 Hz"):
+        clock.follow(round(rate_hz * 2 * CHECK_S), 2 * CHECK_S, new_epoch=False)
     assert clock.wrong
 
 
