@@ -525,5 +525,6 @@ def pad_point(surface: OuterSurface, x_m: float, y_m: float) -> tuple[Floats, Fl
     nearest = pad[np.hypot(pad[:, 0] - x_m * 1e3, pad[:, 1] - y_m * 1e3).argmin()]
     raise ConfigError(
         f"there is no pad at x = {x_m * 1e3:g} mm, y = {y_m * 1e3:g} mm",
-        remedy=f"the nearest place of the pad is about x = {nearest[0]:.1f} mm, y = {nearest[1]:.1f} mm",
+        remedy=f"the nearest place of the pad is about x = {nearest[0]:.1f} mm, "
+        f"y = {nearest[1]:.1f} mm",
     )
