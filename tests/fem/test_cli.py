@@ -310,6 +310,19 @@ def test_calibrate_then_validate(measured: Path, tmp_path: Path) -> None:
         fem("validate", measured, "--only", "ring")
 
 
+def test_a_finger_is_calibrated_at_the_thickness_that_was_measured(
+    measured: Path, tmp_path: Path
+) -> None:
+    fit = tmp_path / "fit.json"
+    words = ("calibrate", measured, "--out", fit, "--workers", 2, "--total-thickness-mm")
+    done = fem(*words, 14.57)
+    assert done.exit_code == 0, done.stdout
+    assert read_parameters(fit).total_thickness_m == pytest.approx(14.57e-3)
+    for thickness_mm in (14.57e-3, "nan"):
+        with pytest.raises(ConfigError, match="total_thickness_m"):
+            fem(*words, thickness_mm)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
