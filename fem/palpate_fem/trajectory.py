@@ -363,9 +363,7 @@ def sample_targets(
         ConfigError: The surface has no such region.
     """
     region = Region() if region is None else region
-    faces = surface.faces
-    if faces.shape[1] == 4:
-        faces = np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]])
+    faces = surface.triangles
     corner = surface.nodes[faces]
     smooth = node_normals(surface.nodes, surface.faces)[faces]
     inside = region.holds(corner.reshape(-1, 3), smooth.reshape(-1, 3)).reshape(-1, 3).any(axis=1)
@@ -497,25 +495,36 @@ def _straight_path(
 
 
 _FACES_DOWN = -0.3  # z of the normal of the pad; steeper skin belongs to a side
-_NEAR_M = 1.0e-3  # twice the edge of a coarse mesh
+_EDGE = -1e-9  # share of a triangle beyond its edge that is rounding
 
 
 def pad_point(surface: OuterSurface, x_m: float, y_m: float) -> tuple[Floats, Floats]:
-    """Point and outward unit normal of the pad nearest to (x, y), both shape (3,), sensor frame.
+    """Point of the pad at (x, y) and outward unit normal there, both shape (3,), sensor frame.
+
+    Both are interpolated in the triangle over (x, y), as those of `sample_targets` are.
 
     Raises:
-        ConfigError: The pad does not reach there; names its extent.
+        ConfigError: There is no pad; names the nearest place of it.
     """
-    normals = node_normals(surface.nodes, surface.faces)
+    smooth, faces = node_normals(surface.nodes, surface.faces), surface.triangles
+    beside = surface.nodes[faces][:, :, :2] - (x_m, y_m)
+    ahead, behind = np.roll(beside, -1, axis=1), np.roll(beside, -2, axis=1)
+    weights = ahead[..., 0] * behind[..., 1] - ahead[..., 1] * behind[..., 0]
+    area = weights.sum(axis=1)  # twice that of the triangle seen from above; below 0: it faces down
+    over = np.flatnonzero((area < 0.0) & (weights <= _EDGE * area[:, None]).all(axis=1))
+    shares = (weights[over] / area[over, None])[..., None]
+    points = (shares * surface.nodes[faces[over]]).sum(axis=1)
+    normals = (shares * smooth[faces[over]]).sum(axis=1)
+    if len(over):
+        lowest = int(points[:, 2].argmin())
+        normal = unit(normals[lowest])
+        if points[lowest, 2] < 0.0 and normal[2] < _FACES_DOWN:
+            return points[lowest], normal
     on_skin = surface.used
-    pad = on_skin[normals[on_skin, 2] < _FACES_DOWN]
-    away = np.hypot(surface.nodes[pad, 0] - x_m, surface.nodes[pad, 1] - y_m)
-    nearest = pad[int(away.argmin())]
-    if not away.min() <= _NEAR_M:
-        low, high = surface.nodes[pad].min(axis=0) * 1e3, surface.nodes[pad].max(axis=0) * 1e3
-        raise ConfigError(
-            f"there is no pad at x = {x_m * 1e3:g} mm, y = {y_m * 1e3:g} mm",
-            remedy=f"the pad reaches from x = {low[0]:.0f} to {high[0]:.0f} mm and from "
-            f"y = {low[1]:.0f} to {high[1]:.0f} mm",
-        )
-    return surface.nodes[nearest], normals[nearest]
+    pad = surface.nodes[on_skin[smooth[on_skin, 2] < _FACES_DOWN]] * 1e3
+    nearest = pad[np.hypot(pad[:, 0] - x_m * 1e3, pad[:, 1] - y_m * 1e3).argmin()]
+    raise ConfigError(
+        f"there is no pad at x = {x_m * 1e3:g} mm, y = {y_m * 1e3:g} mm",
+        remedy=f"the nearest place of the pad is about x = {nearest[0]:.1f} mm, "
+        f"y = {nearest[1]:.1f} mm",
+    )

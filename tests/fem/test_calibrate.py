@@ -310,7 +310,7 @@ def test_runs_that_end_early_are_compared_as_far_as_they_go_and_noted() -> None:
 @pytest.mark.parametrize(
     ("simulator", "why"),
     [
-        (Formula(refuses="sphere_small"), "fewer than two samples"),
+        (Formula(refuses="sphere_small"), "simulation: refused: the mesh is folded"),
         (Formula(stops="sphere_small", stop_m=4.3e-3), "covers"),
         (Formula(stops="sphere_small", stop_m=3.05e-3), "never reaches"),
     ],
@@ -339,7 +339,7 @@ def test_nothing_to_compare_is_an_error() -> None:
         calibrate(Formula(), soft)
     with pytest.raises(DatasetError, match="none given"):
         calibrate(Formula(), [])
-    with pytest.raises(SimulationError, match="sphere_medium/00/angled-0"):
+    with pytest.raises(SimulationError, match="sphere_medium/00/angled-0: refused: the mesh"):
         calibrate(Formula(refuses="sphere_medium"), measure(PLANS[:1]))
 
 

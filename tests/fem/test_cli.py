@@ -250,6 +250,12 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
         (("--path", "press 1 mm, slide 20 mm towards +y", "--step-mm", 0.001), "poses"),
         (("--parameters", "nowhere.json"), "nowhere.json"),
         (("--at-mm", 40, 0), "no pad"),
+        (("--at-mm", -4, "nan"), "--at-mm -4 nan is not finite"),
+        (("--azimuth-deg", "inf", "--angle-deg", 10), "--azimuth-deg inf is not finite"),
+        (("--angle-deg", "nan"), "--angle-deg nan is not finite"),
+        (("--depth-mm", "inf"), "--depth-mm inf is not finite"),
+        (("--path", "press 1 mm", "--step-mm", "inf"), "--step-mm inf is not finite"),
+        (("--limit-s", "inf"), "--limit-s inf is not finite"),
         (("--store", "store.h5"), ".sim"),
         (("--store", f"{__file__}/a.sim"), "no folder"),
         (("--edge-mm", 0), "edge_m"),
@@ -308,6 +314,19 @@ def test_calibrate_then_validate(measured: Path, tmp_path: Path) -> None:
     assert json.loads((out / "validation.json").read_text())["median_n"] < 0.05
     with pytest.raises(ConfigError, match="begins with ring"):
         fem("validate", measured, "--only", "ring")
+
+
+def test_a_finger_is_calibrated_at_the_thickness_that_was_measured(
+    measured: Path, tmp_path: Path
+) -> None:
+    fit = tmp_path / "fit.json"
+    words = ("calibrate", measured, "--out", fit, "--workers", 2, "--total-thickness-mm")
+    done = fem(*words, 14.57)
+    assert done.exit_code == 0, done.stdout
+    assert read_parameters(fit).total_thickness_m == pytest.approx(14.57e-3)
+    for thickness_mm in (14.57e-3, "nan"):
+        with pytest.raises(ConfigError, match="total_thickness_m"):
+            fem(*words, thickness_mm)
 
 
 @pytest.mark.parametrize(

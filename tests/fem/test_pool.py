@@ -46,6 +46,8 @@ class FakeProcess:
         self.state = WorkerState.STARTING
         self.pid = 0
         self.jobs: list[SimulationJob] = []
+        self.cancelled: set[str] = set()
+        self.hears_late = False
         self.report = on_event
 
     def built(self, parameters: FingertipParameters) -> None:
@@ -57,10 +59,14 @@ class FakeProcess:
 
     def end(self) -> None:
         self.built(self.jobs[-1].parameters)
-        self.report(self, JobEnded(IndentationOutcome.COMPLETE, seconds=1.0))
+        stopped = self.jobs[-1].id in self.cancelled
+        outcome = IndentationOutcome.CANCELLED if stopped else IndentationOutcome.COMPLETE
+        self.report(self, JobEnded(outcome, seconds=1.0))
 
     def cancel(self, job_id: str) -> None:
-        raise AssertionError
+        if self.hears_late:
+            self.end()
+        self.cancelled.add(job_id)
 
     def kill(self) -> None:
         return
@@ -164,6 +170,27 @@ def test_any_idle_worker_is_better_than_waiting(bench: Bench) -> None:
     assert bench.events[-1] == JobWaiting(0)
     bench.end(second)
     assert len(bench.workers[second].jobs) == 2, "what waited is started when a worker is free"
+
+
+def test_a_cancel_that_comes_too_late_does_not_stop_the_next_job_of_that_id(bench: Bench) -> None:
+    job = SimulationJob("again", WARM, "cube", np.zeros((2, 7)), PATIENCE_S)
+    bench.pool.submit(job, bench.events.append)
+    (worker,) = (one for one in bench.workers if one.state is WorkerState.BUSY)
+    worker.hears_late = True
+    assert bench.pool.cancel("again")
+    bench.pool.submit(job, bench.events.append)
+    assert worker.state is WorkerState.BUSY
+    worker.end()
+    ends = [event.outcome for event in bench.events if isinstance(event, JobEnded)]
+    assert ends == [IndentationOutcome.COMPLETE] * 2
+
+
+def test_a_cancel_in_time_stops_its_job(bench: Bench) -> None:
+    number = bench.run(WARM)
+    assert bench.pool.cancel("1")
+    bench.end(number)
+    assert isinstance(bench.events[-1], JobEnded)
+    assert bench.events[-1].outcome is IndentationOutcome.CANCELLED
 
 
 def test_an_upkeep_that_hangs_is_noticed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from palpate_fem.indenter.approach import OuterSurface, check_clear
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.distance import signed_distance
 from palpate_fem.indenter.path import PathSegment, check_path, parse_segments
+from palpate_fem.mesh.surface import node_normals
 from palpate_fem.trajectory import (
     ANGLE_RAD,
     ANGLED_DEPTH_M,
@@ -23,6 +25,7 @@ from palpate_fem.trajectory import (
     Campaign,
     Region,
     angled_direction,
+    pad_point,
     press_path,
     sample_targets,
     segment_path,
@@ -155,6 +158,40 @@ def test_a_surface_without_the_region_is_refused() -> None:
         sample_targets(inside_out, 3, region=Region(half_width_m=1e-3))
     with pytest.raises(ConfigError, match="no part of the surface lies in"):
         sample_targets(OuterSurface(FINGER.nodes * 1e3, FINGER.faces), 3)
+
+
+@pytest.mark.parametrize("faces", ["quads", "triangles"])
+def test_a_place_of_the_pad_is_the_one_asked_for_on_every_mesh(faces: str) -> None:
+    for count in (9, 25):
+        finger = make_finger(count)
+        if faces == "triangles":
+            finger = OuterSurface(finger.nodes, finger.triangles)
+        for x, y in [(-7.3e-3, 0.0), (-5.2e-3, 0.5e-3), (-6.1e-3, 0.5e-3), (-0.5e-3, -2.9e-3)]:
+            point, normal = pad_point(finger, x, y)
+            np.testing.assert_allclose(point[:2], [x, y], rtol=0, atol=1e-12)
+            part = np.array([(x + 7.3e-3) / 14e-3, y / 7.1e-3])
+            down = math.sqrt(1.0 - part @ part)
+            assert point[2] == pytest.approx(-0.8e-3 - 7.5e-3 * down, abs=0.25e-3)
+            true = np.array([*(part / [14e-3, 7.1e-3]), -down / 7.5e-3])
+            assert np.linalg.norm(normal) == pytest.approx(1.0)
+            assert normal @ true / np.linalg.norm(true) > math.cos(math.radians(2.5))
+
+
+def test_at_a_node_the_pad_has_the_nodes_place_and_normal() -> None:
+    normals = node_normals(FINGER.nodes, FINGER.faces)
+    lowest = int(FINGER.nodes[:, 2].argmin())
+    point, normal = pad_point(FINGER, *FINGER.nodes[lowest, :2])
+    np.testing.assert_allclose(point, FINGER.nodes[lowest], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(normal, normals[lowest], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("place", [(7e-3, 0.0), (-7.3e-3, 7.2e-3), (3e-3, 6.5e-3)])
+def test_where_no_pad_is_the_nearest_place_of_it_is_named(place: tuple[float, float]) -> None:
+    with pytest.raises(ConfigError, match="no pad at") as refused:
+        pad_point(FINGER, *place)
+    named = re.findall(r"= (\S+) mm", refused.value.remedy)
+    assert len(named) == 2
+    assert np.hypot(*(np.array(named, float) * 1e-3 - place)) < 2e-3
 
 
 def test_the_campaign_is_the_papers() -> None:

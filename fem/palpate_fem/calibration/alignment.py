@@ -43,7 +43,7 @@ _SAME_PLACE_M = 1e-9
 class AlignmentProblem(StrEnum):
     """Why two curves cannot be compared."""
 
-    TOO_SHORT = "fewer than two samples"
+    TOO_SHORT = "has fewer than two samples"
     NEVER_REACHES = "never reaches the threshold force"
     STARTS_ABOVE = "begins above the threshold force"
     NOTHING_BEYOND = "ends where it reaches the threshold force"

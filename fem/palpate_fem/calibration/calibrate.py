@@ -320,5 +320,5 @@ def _hopeless(cases: Sequence[CalibrationCase], fit: ModulusFit) -> SimulationEr
     reasons = "; ".join(f"{cases[i].item.name}: {why}" for i, why in fit.failures.items())
     return SimulationError(
         f"no simulation can be compared with its measurement ({reasons})",
-        remedy="check indenter, sensor frame and path, or give other bounds",
+        remedy="check indenter, sensor frame, path and total thickness, or give other bounds",
     )

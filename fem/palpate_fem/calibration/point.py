@@ -12,6 +12,7 @@ from scipy.optimize import minimize_scalar
 from palpate_fem.calibration.alignment import (
     AlignedCurves,
     AlignmentError,
+    AlignmentProblem,
     Floats,
     ForceCurve,
     align,
@@ -62,6 +63,7 @@ class SimulatedPoint:
         curves: One for each case, at the modulus of the runs.
         thickness_m: Total thickness [m].
         fluid_volume_m3: Fluid [m^3].
+        reasons: Why each run did not complete; "" = it did.
         curve_slopes: Of each curve by the logarithms of the point, shape (P, K, 3); () = unknown.
         thickness_slopes: Of the total thickness [m], shape (P,).
         volume_slopes: Of the fluid [m^3], shape (P,).
@@ -71,6 +73,7 @@ class SimulatedPoint:
     curves: tuple[ForceCurve, ...]
     thickness_m: float
     fluid_volume_m3: float
+    reasons: tuple[str, ...]
     curve_slopes: tuple[Floats, ...] = ()
     thickness_slopes: Floats | None = None
     volume_slopes: Floats | None = None
@@ -81,7 +84,11 @@ class SimulatedPoint:
         known = [run for run in runs if math.isfinite(run.thickness_m)]
         first = known[0] if known else runs[0]
         plain = cls(
-            point, tuple(run.curve for run in runs), first.thickness_m, first.fluid_volume_m3
+            point,
+            tuple(run.curve for run in runs),
+            first.thickness_m,
+            first.fluid_volume_m3,
+            reasons=tuple(run.reason for run in runs),
         )
         slopes = [run.curve_slopes(point) for run in runs]
         found = tuple(slope for slope in slopes if slope is not None)
@@ -98,7 +105,8 @@ class SimulatedPoint:
         """The same without the cases that are not kept."""
         curves = tuple(self.curves[i] for i in kept)
         slopes = tuple(self.curve_slopes[i] for i in kept) if self.curve_slopes else ()
-        return replace(self, curves=curves, curve_slopes=slopes)
+        reasons = tuple(self.reasons[i] for i in kept)
+        return replace(self, curves=curves, curve_slopes=slopes, reasons=reasons)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +186,9 @@ def failures_at(
         try:
             pair = compare(line, case, modulus_pa / settings.reference_shear_modulus_pa, settings)
         except AlignmentError as error:
-            failures[i] = error.problem
+            # A run without steps is refused or fails: that it is short is not why.
+            short = error.reason is AlignmentProblem.TOO_SHORT
+            failures[i] = (state.reasons[i] if short else "") or error.problem
         else:
             if pair.coverage < settings.least_coverage:
                 failures[i] = f"covers {pair.coverage:.0%} of the displacement"

@@ -93,6 +93,7 @@ class CalibrationSettings:
                 f"least coverage {self.least_coverage}, threshold {self.threshold_n} N",
                 remedy="give a share of 1 and a positive force",
             )
+        self.parameters(self.middle())  # refuses a thickness and a modulus out of range
 
     @property
     def volume_is_free(self) -> bool:

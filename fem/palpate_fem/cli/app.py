@@ -381,14 +381,33 @@ def calibrate(
     edge_mm: EdgeOption = None,
     layers: LayersOption = 2,
     slopes: SlopesOption = False,
+    total_thickness_mm: Annotated[
+        float,
+        typer.Option(
+            "--total-thickness-mm",
+            help="Filled finger from nail to pad, by caliper [mm]; sets the fluid volume.",
+        ),
+    ] = 15.1,
 ) -> None:
-    """Find skin thickness, modulus, friction and fluid volume from measured forces."""
+    """Find skin thickness, modulus and friction from measured forces.
+
+    The fluid volume follows from the total thickness, which the presses do not tell.
+    """
     from palpate_fem.cli.identify import calibrate_command
     from palpate_fem.cli.model import model_of
 
     model = model_of(mesh=mesh, edge_mm=edge_mm, layers=layers)
     raise typer.Exit(
-        calibrate_command(measured, out, only or [], model, png=png, workers=workers, slopes=slopes)
+        calibrate_command(
+            measured,
+            out,
+            only or [],
+            model,
+            png=png,
+            workers=workers,
+            slopes=slopes,
+            total_thickness_m=total_thickness_mm * 1e-3,
+        )
     )
 
 

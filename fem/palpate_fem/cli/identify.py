@@ -27,6 +27,7 @@ from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, recover
 from palpate_fem.calibration.result import Calibration, Evaluation, write_calibration
 from palpate_fem.calibration.runs import FingertipSimulator, simulate_all
+from palpate_fem.calibration.settings import CalibrationSettings
 from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import console, print_lines, print_table, progress_bar
 from palpate_fem.config import EDGE_M, FingertipParameters
@@ -72,16 +73,19 @@ def calibrate_command(
     png: Path | None,
     workers: int,
     slopes: bool,
+    total_thickness_m: float,
 ) -> int:
-    """Calibrate and write the result; 1 if the search did not converge."""
+    """Calibrate a finger this thick and write the result; 1 if the search did not converge."""
     check_output(out, "--out", ".json", measured)
     check_output(png, "--png", ".png", measured)
+    settings = CalibrationSettings(target_thickness_m=total_thickness_m)
     chosen = _chosen(measured, only)
     runs_with = slope_simulator_for if slopes else simulator_for
     with runs_with(model, workers, len(chosen)) as (simulator, executor, bar):
         result = calibrate(
             simulator,
             chosen,
+            settings=settings,
             executor=executor,
             on_evaluation=bar.on_evaluation,
             on_run=bar.on_run,

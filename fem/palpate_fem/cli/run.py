@@ -117,6 +117,18 @@ class RunOptions:
         """
         for name in self.indenters:
             make_indenter(name)
+        numbers = {
+            "--depth-mm": (self.depth_m * 1e3,),
+            "--at-mm": tuple(value * 1e3 for value in self.at_m),
+            "--angle-deg": (self.angle_deg,),
+            "--azimuth-deg": (self.azimuth_deg,),
+            "--step-mm": (self.step_m * 1e3,),
+            "--limit-s": (self.limit_s,),
+        }
+        for name, values in numbers.items():
+            if not all(map(math.isfinite, values)):
+                given = " ".join(f"{value:g}" for value in values)
+                raise ConfigError(f"{name} {given} is not finite", remedy="give finite numbers")
         ways = {"--sweep": self.sweep, "--path": self.path, "--poses": self.poses}
         chosen = [name for name, value in ways.items() if value]
         if len(chosen) > 1:

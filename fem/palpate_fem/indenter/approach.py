@@ -44,6 +44,13 @@ class OuterSurface:
         return np.asarray(np.einsum("ks,fki->fsi", weights, self.nodes[chosen]))
 
     @cached_property
+    def triangles(self) -> Ints:
+        """Corners of the faces, each quadrilateral as two triangles, shape (N, 3)."""
+        if self.faces.shape[1] == 3:
+            return self.faces
+        return np.concatenate([self.faces[:, :3], self.faces[:, [0, 2, 3]]])
+
+    @cached_property
     def used(self) -> NDArray[np.integer]:
         """Numbers of the nodes that are a face's corner, ascending."""
         return np.unique(self.faces)

@@ -38,7 +38,7 @@ class SimulationJob:
     """One trajectory to simulate.
 
     Attributes:
-        id: Unique among the jobs that wait or run.
+        id: Unique among the jobs that wait or run; at a worker, among all jobs of its pool.
         parameters: Of the fingertip.
         indenter: Name of the indenter.
         path: Poses, shape (K, 7); the first does not touch the skin.

@@ -7,6 +7,7 @@ killed. Each job's owner gets exactly one last event, whatever happens.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import threading
@@ -98,11 +99,12 @@ class WorkerProcess(ChildProcess):
 class PoolTask:
     """A job on its way through the pool.
 
-    ``deadline`` and ``overdue`` are monotonic times [s]: when it must stop, and when its worker is
-    killed because it has not.
+    ``key`` is its id towards its worker; no other task has it. ``deadline`` and ``overdue`` are
+    monotonic times [s]: when it must stop, and when its worker is killed because it has not.
     """
 
     job: SimulationJob
+    key: str
     on_event: OnEvent
     deadline: float
     overdue: float = math.inf
@@ -153,6 +155,7 @@ class WorkerPool(Closing):
         self._on_fingertip = on_fingertip or (lambda _: None)
         self._lock = threading.Lock()
         self._closing = threading.Event()
+        self._numbers = itertools.count()
         self._waiting: deque[PoolTask] = deque()
         self._running: dict[WorkerProcess, PoolTask] = {}
         # Fingertips that each worker keeps, the last used one at the end, as in `FingertipCache`.
@@ -223,7 +226,8 @@ class WorkerPool(Closing):
             if not accepted and len(self._waiting) >= self._capacity + free:
                 wait_s = self._typical_s * (len(self._waiting) + 1) / max(1, len(self._workers))
                 raise pool_full(len(self._running), len(self._waiting), wait_s)
-            self._waiting.append(PoolTask(job, on_event, now + job.deadline_s))
+            key = str(next(self._numbers))
+            self._waiting.append(PoolTask(job, key, on_event, now + job.deadline_s))
         self._dispatch()
 
     def cancel(self, job_id: str) -> bool:
@@ -247,7 +251,8 @@ class WorkerPool(Closing):
             self._finish(task, JobEnded(IndentationOutcome.CANCELLED, "cancelled while it waited"))
             self._report_waiting()
         else:
-            worker.cancel(job_id)
+            # By its own id: another job may have the caller's by the time that the worker hears it.
+            worker.cancel(task.key)
         return True
 
     def take_back(self, wanted: Callable[[SimulationJob], bool]) -> list[PoolTask]:
@@ -298,7 +303,7 @@ class WorkerPool(Closing):
                 task.overdue = task.deadline + self._grace_s
                 self._running[worker] = task
                 left_s = max(0.0, task.deadline - time.monotonic())
-                worker.start(replace(task.job, deadline_s=left_s))
+                worker.start(replace(task.job, id=task.key, deadline_s=left_s))
                 moved = True
         if moved or self.waiting:
             self._report_waiting()

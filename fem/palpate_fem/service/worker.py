@@ -109,7 +109,7 @@ class Worker:
                 sys.excepthook(type(error), error, error.__traceback__)
             return JobFailed.of(error)
         finally:
-            self._cancelled.discard(job.id)
+            self._cancelled.clear()  # also of what came too late for an earlier job
         return JobEnded(done.outcome, done.reason, done.travel_m, done.seconds)
 
     def _report(self, event: JobEvent) -> None:

@@ -133,7 +133,7 @@ def _aligned(
             )
         raise DatasetError(
             f"{name}: the simulation reaches {largest:.3g} N in its {len(force)} converged steps",
-            remedy="smaller steps may converge further; else drop the trial",
+            remedy="press deeper, or in smaller steps if it diverged; else drop the trial",
         )
     travel_m = start.rows(simulated.travel_m[believed])
     if (np.diff(travel_m) <= 0).any():

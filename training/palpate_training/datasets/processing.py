@@ -24,7 +24,7 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate.messages import COUNTS_MAX
 from palpate.process import require
-from palpate_training.datasets.trials import RawTrial, TrialRows, trial_name
+from palpate_training.datasets.trials import RawTrial, TrialRows, reason_of, trial_name
 
 CUTOFF_HZ = 5.0
 """Of the first-order Butterworth low-pass (paper)."""
@@ -56,7 +56,8 @@ def process_all(trials: Iterable[RawTrial]) -> tuple[list[TrialRows], list[tuple
         try:
             kept.append(process(raw))
         except DatasetError as error:
-            dropped.append((trial_name(raw.header), str(error)))
+            name = trial_name(raw.header)
+            dropped.append((name, reason_of(name, error)))
     return kept, dropped
 
 
@@ -213,7 +214,8 @@ def _onset(rows: TrialRows) -> ForceOnset:
     raise DatasetError(
         f"{trial_name(rows.header)}: the force never stays at {THRESHOLD_N} N or more; its largest"
         f" is {magnitude.max():.3g} N",
-        remedy="the indenter missed the finger; check its start or drop the trajectory",
+        remedy="the indenter pressed too lightly or missed the finger: press deeper, check its "
+        "start, or drop the trajectory",
     )
 
 

@@ -66,6 +66,11 @@ def trial_name(header: TrialHeader) -> str:
     return f"{header.unit} {header.trajectory}"
 
 
+def reason_of(trial: str, error: DatasetError) -> str:
+    """Why a trial is left out, to be told after its name, which the error begins with, too."""
+    return str(error).removeprefix(f"{trial}: ")
+
+
 @dataclass(frozen=True, slots=True)
 class RawTrial:
     """Streams of one trial on one clock, at 100 Hz or more, from 3 mm before contact on.

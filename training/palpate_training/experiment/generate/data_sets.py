@@ -43,6 +43,7 @@ from palpate_training.datasets.trials import (
     MixedRows,
     SimulatedTrial,
     TrialRows,
+    reason_of,
     trial_name,
 )
 from palpate_training.experiment.generate.simulator import (
@@ -456,7 +457,8 @@ def _mixed(
         try:
             yield mix(one, simulated[one.header.trajectory])
         except DatasetError as error:
-            dropped.append((trial_name(one.header), str(error)))
+            name = trial_name(one.header)
+            dropped.append((name, reason_of(name, error)))
 
 
 def skin_mesh(fingertip: SimulatedFingertip) -> SkinMesh:

@@ -101,7 +101,7 @@ def process_files(
     dropped = tuple(sorted(lost))
     if not rows:
         raise DatasetError(
-            f"none of {total} trials gave rows; the first: {dropped[0][1]}",
+            f"none of {total} trials gave rows; the first: {': '.join(dropped[0])}",
             remedy="look at the plan and the record; nothing was written",
         )
     provenance = Provenance(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate_training.datasets.processing import from_half_newton, tare
-from palpate_training.datasets.trials import TrialHeader, TrialRows
+from palpate_training.datasets.trials import TrialHeader, TrialRows, reason_of
 from palpate_training.experiment.clearance import pad_poses, simulate_registrations
 from palpate_training.experiment.generate.simulator import (
     ExperimentSpec,
@@ -261,7 +261,7 @@ def execute(pressed: PressedSpecimens, task: TrialTask) -> TrialsDone:
         try:
             kept.append(_perform(task, trajectory, steps, specimen, error, counts[specimen.name]))
         except DatasetError as failure:
-            dropped.append((specimen.name, str(failure)))
+            dropped.append((specimen.name, reason_of(f"{specimen.name} {task.name}", failure)))
     return TrialsDone(task.name, tuple(kept), tuple(dropped), counts, len(steps))
 
 
