@@ -98,6 +98,28 @@ def test_a_strangers_table_is_read_by_a_map(data: FeatureDataset, tmp_path: Path
     np.testing.assert_array_equal(same, data.group[:, None] == data.group)
 
 
+def test_labels_in_csv_are_names(data: FeatureDataset, tmp_path: Path) -> None:
+    """Not numbers, of which "007" and "7" would be one, nor words for nothing."""
+    names = ("007", "7", "NA")
+    own, other = tmp_path / "own.csv", tmp_path / "other.csv"
+    export_table(own, replace(data, sensor_names=names), csv=True)
+    heading, rows = own.read_text().split("\n", 1)
+    other.write_text(
+        heading.replace('"sensor"', '"finger"').replace('"group"', '"press"') + "\n" + rows
+    )
+    ours = ColumnMap.ours(read_table(own).column_names)
+    for path, columns in (
+        (own, ours),
+        (other, ours.model_copy(update={"sensor": "finger", "group": "press"})),
+    ):
+        back = dataset_of(read_table(path, columns), columns, source=path)
+        assert back.sensor_names == names
+        np.testing.assert_array_equal(back.sensor, data.sensor)
+    other.write_text(own.read_text().replace('"NA"', '""'))
+    with pytest.raises(DatasetError, match=f"sensor is not known in row {data.sensor.argmax()}"):
+        dataset_of(read_table(other), ours, source=other)
+
+
 def test_without_groups_a_file_is_cut_into_blocks(data: FeatureDataset) -> None:
     table = table_of(data).drop_columns(["group", "block", "sensor"])
     back = dataset_of(table, ColumnMap.ours(table.column_names), source=Path("x.csv"))

@@ -147,11 +147,11 @@ def data_import(
 
     palpate data import presses.csv presses.h5 --columns map.toml
     """
-    table = read_lerobot(source) if source.is_dir() else read_table(source)
-    found = ColumnMap.read(columns) if columns else ColumnMap.ours(table.column_names)
+    told = ColumnMap.read(columns) if columns else None
+    table = read_lerobot(source) if source.is_dir() else read_table(source, told)
     data = dataset_of(
         table,
-        found,
+        told or ColumnMap.ours(table.column_names),
         source=source,
         sensor=sensor,
         licence=licence,

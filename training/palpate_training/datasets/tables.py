@@ -43,6 +43,9 @@ BLOCKS = 20
 PROVENANCE_COLUMNS = ("source", "licence")
 """Columns of a CSV file of ours that say the same in every row."""
 
+LABELS = ("sensor", "group", "block")
+"""Keys of a map, and columns of ours, that hold names."""
+
 MISSING = np.iinfo(np.int64).min
 """Stands for a time, a label or a truth that a row lacks."""
 
@@ -200,8 +203,13 @@ def export_table(path: Path, data: FeatureDataset, *, csv: bool = False) -> None
     written_new(path, write)
 
 
-def read_table(path: Path) -> pa.Table:
+def read_table(path: Path, columns: ColumnMap | None = None) -> pa.Table:
     """Read a CSV or Parquet file whole.
+
+    Args:
+        path: Of the file.
+        columns: Which are labels: in CSV they stay the text that they are, as "007" and "7" are two
+            fingers; None = palpate's own names.
 
     Raises:
         DatasetError: It is missing, or neither.
@@ -211,9 +219,13 @@ def read_table(path: Path) -> pa.Table:
     import pyarrow.csv
     import pyarrow.parquet
 
+    names = LABELS if columns is None else [getattr(columns, name) for name in LABELS]
+    labels = pyarrow.csv.ConvertOptions(
+        column_types={name: arrow.string() for name in names if name}
+    )
     try:
         if path.suffix.lower() == ".csv":
-            return pyarrow.csv.read_csv(path)
+            return pyarrow.csv.read_csv(path, convert_options=labels)
         return pyarrow.parquet.read_table(path)
     except (OSError, arrow.ArrowException) as error:
         raise DatasetError(
