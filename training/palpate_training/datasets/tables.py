@@ -57,6 +57,16 @@ _STEMS = {
     "contact_location": ("contact_location", "_m"),
     "centre_of_pressure": ("centre_of_pressure", "_m"), "contact_normal": ("contact_normal", ""),
 }  # fmt: skip
+LISTS = {
+    "electrodes": "observation.electrodes",
+    "baseline": "observation.electrodes_at_rest",
+    "force": "observation.force",
+    "contact_location": "observation.contact_location",
+    "centre_of_pressure": "observation.centre_of_pressure",
+    "contact_normal": "observation.contact_normal",
+}
+"""Names of a LeRobotDataset's features that hold a list, by our arrays."""
+
 _UNITS = {
     "force": {"N": 1.0, "mN": 1e-3},
     "length": {"m": 1.0, "mm": 1e-3},
@@ -133,11 +143,13 @@ class ColumnMap(BaseModel):
     @classmethod
     def ours(cls, columns: Sequence[str]) -> ColumnMap:
         """Of a table with palpate's own names, as far as it has them."""
-        known = {
+        known: dict[str, Columns] = {
             name: names
             for name in _STEMS
             if set(names := columns_of(name)) <= set(columns) or name in ("electrodes", "force")
         }
+        if {LISTS["electrodes"], LISTS["force"], *LABELS} <= set(columns):  # LeRobot's, by us
+            known = {name: column for name, column in LISTS.items() if column in columns}
         rest = known.pop("baseline", None)
         single = {
             name: name for name in ("in_contact", "group", "block", "sensor") if name in columns
