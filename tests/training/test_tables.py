@@ -126,6 +126,28 @@ def test_without_groups_a_file_is_cut_into_blocks(data: FeatureDataset) -> None:
     assert (np.diff(back.block) >= 0).all()
 
 
+def test_a_press_of_several_sensors_is_one_if_the_map_says_so(data: FeatureDataset) -> None:
+    """Else it could be learned from on one sensor and tested with on another."""
+    names = [
+        {"group": "press", "block": "piece"}.get(name, name) for name in table_of(data).column_names
+    ]
+    table = table_of(data).rename_columns(names)
+    columns = ColumnMap.ours(names).model_copy(update={"group": "press"})
+    apart = dataset_of(table, columns, source=Path("x"))
+    same_press(apart.group, data.group * 10 + data.sensor)
+    alike = columns.model_copy(update={"groups_across_sensors": True})
+    together = dataset_of(table, alike, source=Path("x"))
+    same_press(together.group, data.group)
+    same_press(together.block, data.group)
+    single = table.set_column(names.index("press"), "press", pa.array(["only"] * len(data)))
+    cut = dataset_of(single, alike, source=Path("x"))
+    assert len(np.unique(cut.group)) == 1
+    for sensor in range(3):  # each from its beginning to its end
+        own = cut.block[cut.sensor == sensor]
+        assert list(np.unique(own)) == list(range(cut.block.max() + 1))
+        assert (np.diff(own) >= 0).all()
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

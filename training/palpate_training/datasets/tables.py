@@ -95,6 +95,8 @@ class ColumnMap(BaseModel):
         in_contact: Whether something touches, true or false, or 0 or 1.
         time: Of the row.
         group: Press or episode.
+        groups_across_sensors: The same label on several sensors is one press, as of simulated ones
+            that were pressed alike; else each sensor has a press of its own.
         block: Piece of a group that is held out as a whole; none = the group, or where each sensor
             has but one, twenty pieces of it.
         sensor: Name of the BioTac.
@@ -115,6 +117,7 @@ class ColumnMap(BaseModel):
     in_contact: str | None = None
     time: str | None = None
     group: str | None = None
+    groups_across_sensors: bool = False
     block: str | None = None
     sensor: str | None = None
     force_unit: Literal["N", "mN"] = "N"
@@ -296,7 +299,8 @@ def dataset_of(
     arrays["electrodes"] = _counts(arrays["electrodes"], np.flatnonzero(kept), source)
     if "baseline" not in arrays:
         arrays["baseline"] = _rest(arrays, columns.rest_rows, source)
-    across = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
+    ours = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
+    across = columns.groups_across_sensors or ours
     arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
     if "time_ns" in arrays:
         _check_order(arrays, np.flatnonzero(kept), source)
@@ -526,10 +530,13 @@ def _groups(arrays: Mapping[str, Any], *, labelled: bool, across: bool) -> dict[
         ].reshape(-1)
         for names in (("group",), ("group", "block"))
     )
-    if labelled or group.max() > arrays["sensor"].max():
+    single = 1 if across else len(np.unique(arrays["sensor"]))
+    if labelled or len(np.unique(group)) > single:
         return {"group": group, "block": block}
     for number in np.unique(group):
-        own = np.flatnonzero(group == number)
-        pieces = min(BLOCKS, len(own))
-        block[own] = BLOCKS * number + cut_into_blocks(len(own), pieces)
+        sensors, rows = np.unique(arrays["sensor"][group == number], return_counts=True)
+        pieces = min(BLOCKS, *rows)
+        for sensor, count in zip(sensors, rows, strict=True):  # pressed alike, so cut alike
+            own = (group == number) & (arrays["sensor"] == sensor)
+            block[own] = BLOCKS * number + cut_into_blocks(count, pieces)
     return {"group": group, "block": block}
