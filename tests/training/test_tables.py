@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 from tests.training.invented_population import population
@@ -148,9 +149,29 @@ def test_a_press_of_several_sensors_is_one_if_the_map_says_so(data: FeatureDatas
         assert (np.diff(own) >= 0).all()
 
 
+def test_timestamps_are_taken_as_they_are(data: FeatureDataset, tmp_path: Path) -> None:
+    """Whatever the unit of the column is, or the map says."""
+    assert data.time_ns is not None
+    stamps = pa.array(data.time_ns).cast(pa.timestamp("ns"))
+    table = table_of(data)
+    place = table.column_names.index("time_ns")
+    columns = ColumnMap.ours(table.column_names).model_copy(update={"time_unit": "s"})
+    for kind in ("timestamp[ns]", "timestamp[ms]", pa.timestamp("us", "Europe/Berlin")):
+        stamped = table.set_column(place, "time_ns", stamps.cast(kind))
+        back = dataset_of(stamped, columns, source=Path("x"))
+        np.testing.assert_array_equal(back.time_ns, data.time_ns)
+    pyarrow.csv.write_csv(stamped, tmp_path / "stamped.csv")
+    back = dataset_of(read_table(tmp_path / "stamped.csv"), columns, source=Path("x"))
+    np.testing.assert_array_equal(back.time_ns, data.time_ns)
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
+        (lambda rows: of_type(rows, "time_ns", pa.duration("ns")), r"'time_ns' holds duration"),
+        (lambda rows: of_type(rows, "time_ns", pa.timestamp("s")), "not times from 1678 to 2261"),
+        (lambda rows: of_type(rows, "force_x_n", pa.timestamp("s")), "'force_x_n' holds timestamp"),
+        (lambda rows: put(rows, "time_ns", "noon"), "'time_ns' holds string, not numbers"),
         (lambda rows: rows.drop_columns(["electrode_7"]), "no column 'electrode_7'"),
         (lambda rows: rows.drop_columns(columns_of("baseline")), "untouched"),
         (lambda rows: put(rows, "electrode_3", 17.5), r"E3 reads 17\.5 in row 4"),
@@ -176,6 +197,12 @@ def test_a_wrong_table_is_refused(data: FeatureDataset, change: object, says: st
     table = change(table_of(data))  # type: ignore[operator]
     with pytest.raises(DatasetError, match=says):
         dataset_of(table, ColumnMap.ours(table.column_names), source=Path("lab.csv"))
+
+
+def of_type(table: pa.Table, name: str, kind: pa.DataType) -> pa.Table:
+    """A table with one column of another type."""
+    values = table.column(name).cast("int64", safe=False).cast(kind)
+    return table.set_column(table.column_names.index(name), name, values)
 
 
 def lack(table: pa.Table, name: str) -> pa.Table:
@@ -230,6 +257,11 @@ def test_lists_of_another_width_are_refused(data: FeatureDataset) -> None:
     columns = ColumnMap(electrodes="skin", force=columns_of("force"), rest_rows=3)
     with pytest.raises(DatasetError, match=r"'skin' holds 18 numbers in row 3, not 19"):
         dataset_of(table, columns, source=Path("x"))
+    words = table.set_column(
+        len(table.column_names) - 1, "skin", pa.array([["a"] * 19] * len(skin))
+    )
+    with pytest.raises(DatasetError, match=r"'skin' holds list<.*string>, not lists of numbers"):
+        dataset_of(words, columns, source=Path("x"))
     short = columns.model_copy(update={"electrodes": ["electrode_1", "electrode_2"]})
     with pytest.raises(DatasetError, match=r"2 columns are named from 'electrode_1' on, not 19"):
         dataset_of(table, short, source=Path("x"))

@@ -102,7 +102,7 @@ class ColumnMap(BaseModel):
         sensor: Name of the BioTac.
         force_unit: N or mN.
         length_unit: m or mm.
-        time_unit: s, ms, us or ns.
+        time_unit: s, ms, us or ns, of times that are numbers; timestamps say theirs.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -372,8 +372,11 @@ class _Reader:
         return np.where(lacking, MISSING, values == 1.0)
 
     def times(self, name: str, scale: float) -> npt.NDArray[np.int64]:
-        """Times [ns] or ``MISSING``, shape (N,); whole numbers are not rounded."""
+        """Times [ns] or ``MISSING``, shape (N,); whole numbers and timestamps are not rounded."""
         column = self._found(name)
+        if "timestamp" in str(column.type):  # which says its unit itself
+            known = self._cast(name, "timestamp[ns]", "times from 1678 to 2261", safe=True)
+            column, scale = known.cast("int64"), 1.0
         if scale == 1.0 and str(column.type) in ("int64", "uint64", "int32", "uint32"):
             whole = np.asarray(column.fill_null(0).to_numpy(), np.int64)
             return np.where(column.is_null().to_numpy(), MISSING, whole)
@@ -412,15 +415,15 @@ class _Reader:
     def _column(self, name: str) -> Values:
         """Numbers of one column, shape (N,); a minus before its name turns the sign."""
         plain = name.removeprefix("-") if name not in self._table.column_names else name
-        column = self._found(plain)
-        try:
-            values = np.asarray(column.cast("float64", safe=False).to_numpy(), np.float64)
-        except (ValueError, TypeError) as error:  # of Arrow: its base is ValueError or TypeError
-            raise DatasetError(
-                f"{self._source}: column {plain!r} holds {column.type}, not numbers",
-                remedy="name another column",
-            ) from error
+        values = np.asarray(self._cast(plain, "float64", "numbers").to_numpy(), np.float64)
         return values if plain == name else -values
+
+    def _cast(self, name: str, kind: str, wanted: str, *, safe: bool = False) -> Any:
+        column = self._found(name)
+        try:
+            return column.cast(kind, safe=safe)
+        except (ValueError, TypeError, NotImplementedError) as error:  # bases of Arrow's errors
+            raise self._other(name, wanted) from error
 
     def _lists(self, name: str, width: int) -> Values:
         column = self._found(name)
@@ -431,7 +434,16 @@ class _Reader:
             if row is None or len(row) != width:
                 size = "nothing" if row is None else f"{len(row)} numbers"
                 raise self._wrong(name, number, size, f"{width} numbers")
-        return np.array(rows, np.float64)
+        try:
+            return np.array(rows, np.float64)
+        except (ValueError, TypeError) as error:  # of lists of text, or of lists
+            raise self._other(name, "lists of numbers") from error
+
+    def _other(self, name: str, wanted: str) -> DatasetError:
+        return DatasetError(
+            f"{self._source}: column {name!r} holds {self._found(name).type}, not {wanted}",
+            remedy="give numbers (for a time also timestamps), or name another column",
+        )
 
     def _wrong(self, name: str, row: int, found: str, wanted: str) -> DatasetError:
         return DatasetError(
