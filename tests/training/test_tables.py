@@ -149,6 +149,14 @@ def test_a_press_of_several_sensors_is_one_if_the_map_says_so(data: FeatureDatas
         assert (np.diff(own) >= 0).all()
 
 
+def no_rest(table: pa.Table) -> pa.Table:
+    """A table of which somebody subtracted the rest."""
+    for name in columns_of("baseline"):
+        place = table.column_names.index(name)
+        table = table.set_column(place, name, pa.array(np.zeros(len(table))))
+    return table
+
+
 def test_timestamps_are_taken_as_they_are(data: FeatureDataset, tmp_path: Path) -> None:
     """Whatever the unit of the column is, or the map says."""
     assert data.time_ns is not None
@@ -177,6 +185,9 @@ def test_timestamps_are_taken_as_they_are(data: FeatureDataset, tmp_path: Path) 
         (lambda rows: put(rows, "electrode_3", 17.5), r"E3 reads 17\.5 in row 4"),
         (lambda rows: put(rows, "electrode_3", 4096.0), r"E3 reads 4096 in row 4"),
         (lambda rows: put(rows, "electrode_3", float("nan")), "electrodes is not known in row 4"),
+        (lambda rows: put(rows, "rest_3", -5.0), r"rest of E3 is -5 in row 4"),
+        (lambda rows: put(rows, "rest_3", 1e9), r"rest of E3 is 1e\+09 in row 4"),
+        (no_rest, r"rest of E1 is 0 in row 0"),
         (lambda rows: put(rows, "force_z_n", float("inf")), "force is not known in row 4"),
         (lambda rows: put(rows, "in_contact", 3.0), "'in_contact' holds 3 in row 4"),
         (lambda rows: put(rows, "in_contact", None), "in_contact is not known in row 4"),
@@ -275,6 +286,12 @@ def test_lists_of_another_width_are_refused(data: FeatureDataset) -> None:
         ("electrodes = 'e'\nforce = 'f'\nvoltage = 'v'", "voltage"),
         ("electrodes = 'e'\nforce = 'f'\ntime_unit = 'h'", "time_unit"),
         ("electrodes = ", "map.toml"),
+        ("electrodes = ['E1', 'E2', 'E1']\nforce = 'f'", "map.toml: column 'E1' is named twice"),
+        ("electrodes = 'e'\nforce = ['x', 'y', '-x']", "column 'x' is named twice"),
+        ("electrodes = 'e'\nforce = 'f'\nrest = 'e'", "column 'e' is named twice"),
+        ("electrodes = 'e'\nforce = 'f'\ntime = 't'\ngroup = 't'", "column 't' is named twice"),
+        ("electrodes = 'e'\nforce = 'f'\nrest = 'r'\nrest_rows = 3", "rest and rest_rows"),
+        ("electrodes = 'e'\nforce = 'f'\ngroups_across_sensors = true", "without group"),
     ],
 )
 def test_a_wrong_map_is_refused(tmp_path: Path, text: str, says: str) -> None:

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from palpate import __version__
 from palpate.errors import ConfigError, DatasetError
@@ -28,6 +29,7 @@ from palpate_training.datasets.export import written_new
 from palpate_training.datasets.features import (
     ELECTRODES,
     FEATURE_COLUMNS,
+    OF_CONTACT,
     FeatureDataset,
     cut_into_blocks,
 )
@@ -124,6 +126,24 @@ class ColumnMap(BaseModel):
     length_unit: Literal["m", "mm"] = "m"
     time_unit: Literal["s", "ms", "us", "ns"] = "s"
 
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        """Refuse a column in two places, and keys that contradict."""
+        if self.rest is not None and self.rest_rows is not None:
+            raise ValueError("rest and rest_rows are both there: give one of them")
+        if self.groups_across_sensors and self.group is None:
+            raise ValueError("groups_across_sensors is there without group: name its column")
+        keys = ("electrodes", "rest", "force", *OF_CONTACT, "in_contact", "time")
+        told = [names for key in keys if (names := getattr(self, key)) is not None]
+        numbers = [
+            name for names in told for name in ([names] if isinstance(names, str) else names)
+        ]
+        labels = {getattr(self, name) for name in LABELS} - {None}  # may share a column
+        counted = Counter(name.removeprefix("-") for name in (*numbers, *labels))
+        if repeated := [name for name, times in counted.items() if times > 1]:
+            raise ValueError(f"column {repeated[0]!r} is named twice: each holds one thing")
+        return self
+
     @classmethod
     def read(cls, path: Path) -> ColumnMap:
         """Read a TOML file.
@@ -138,8 +158,9 @@ class ColumnMap(BaseModel):
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
+            said = first["msg"].removeprefix("Value error, ")
             raise ConfigError(
-                f"{path}: {where}: {first['msg']}",
+                ": ".join(filter(None, (str(path), where, said))),
                 remedy="electrodes and force must be there; all names: docs/data.md",
             ) from error
 
@@ -272,8 +293,8 @@ def dataset_of(
 
     Raises:
         DatasetError: A column is missing, there twice, of another width, or holds something else; a
-            number is missing; electrodes are no whole counts; nothing says what electrodes read
-            untouched; rows of a press are not in order of time.
+            number is missing; electrodes are no whole counts, the rest no counts; nothing says what
+            electrodes read untouched; rows of a press are not in order of time.
     """
     reader = _Reader(table, source)
     arrays: dict[str, Any] = {
@@ -297,7 +318,9 @@ def dataset_of(
     kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
     arrays = {name: array[kept] for name, array in arrays.items()}
     arrays["electrodes"] = _counts(arrays["electrodes"], np.flatnonzero(kept), source)
-    if "baseline" not in arrays:
+    if "baseline" in arrays:
+        _check_rest(arrays["baseline"], np.flatnonzero(kept), source)
+    else:
         arrays["baseline"] = _rest(arrays, columns.rest_rows, source)
     ours = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
     across = columns.groups_across_sensors or ours
@@ -508,6 +531,19 @@ def _counts(values: Values, rows: npt.NDArray[np.int64], source: Path) -> Values
             remedy="give raw counts as the BioTac sends them, nothing subtracted or scaled",
         )
     return np.asarray(counts)
+
+
+def _check_rest(rest: Values, rows: npt.NDArray[np.int64], source: Path) -> None:
+    """Refuse untouched counts that no BioTac sends; ``rows`` are those of the table."""
+    bad = (rest < 0.0) | (rest > COUNTS_MAX)
+    bad |= ~rest.any(axis=1, keepdims=True)  # of counts from which the rest was subtracted
+    if bad.any():
+        row, electrode = (int(index) for index in np.argwhere(bad)[0])
+        raise DatasetError(
+            f"{source}: the rest of E{electrode + 1} is {rest[row, electrode]:g} in row"
+            f" {rows[row]}, not untouched counts (0 to {COUNTS_MAX}, not all 0)",
+            remedy="give raw counts of the untouched BioTac, nothing subtracted or scaled",
+        )
 
 
 def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
