@@ -173,6 +173,25 @@ def test_timestamps_are_taken_as_they_are(data: FeatureDataset, tmp_path: Path) 
     np.testing.assert_array_equal(back.time_ns, data.time_ns)
 
 
+@pytest.mark.parametrize(("unit", "ns"), [("us", 10**3), ("ms", 10**6), ("s", 10**9)])
+def test_whole_times_are_not_rounded(data: FeatureDataset, unit: str, ns: int) -> None:
+    whole = (10**18 + 10**9 + 7 * 10**3) // ns + np.arange(len(data))
+    table = table_of(data)
+    place = table.column_names.index("time_ns")
+    columns = ColumnMap.ours(table.column_names).model_copy(update={"time_unit": unit})
+    for kind in (np.int64, np.uint64):
+        times = pa.array(whole.astype(kind))
+        back = dataset_of(table.set_column(place, "time_ns", times), columns, source=Path("x"))
+        assert back.time_ns is not None
+        np.testing.assert_array_equal(back.time_ns, whole * ns)
+    lacking = lack(table.set_column(place, "time_ns", times), "time_ns")
+    with pytest.raises(DatasetError, match="time_ns is not known in row 4"):
+        dataset_of(lacking, columns, source=Path("x"))
+    far = table.set_column(place, "time_ns", pa.array(np.full(len(data), 2**63, np.uint64)))
+    with pytest.raises(DatasetError, match=r"holds 9\.22337e\+18 in row 0, not a time"):
+        dataset_of(far, columns, source=Path("x"))
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -400,16 +400,16 @@ class _Reader:
         if "timestamp" in str(column.type):  # which says its unit itself
             known = self._cast(name, "timestamp[ns]", "times from 1678 to 2261", safe=True)
             column, scale = known.cast("int64"), 1.0
-        if scale == 1.0 and str(column.type) in ("int64", "uint64", "int32", "uint32"):
-            whole = np.asarray(column.fill_null(0).to_numpy(), np.int64)
-            return np.where(column.is_null().to_numpy(), MISSING, whole)
-        values = self._column(name)
-        lacking = np.isnan(values)
-        wrong = np.flatnonzero(~(np.abs(values * scale) < 2.0**63) & ~lacking)
+        whole = str(column.type).removeprefix("u").startswith("int")
+        values = column.fill_null(0).to_numpy() if whole else self._column(name)
+        lacking = column.is_null().to_numpy() if whole else np.isnan(values)
+        most = (2**63 - 1) // int(scale)
+        wrong = np.flatnonzero(~((values > -most) & (values < most)) & ~lacking)
         if wrong.size:
             raise self._wrong(name, int(wrong[0]), f"{values[wrong[0]]:g}", "a time")
-        known = np.rint(np.where(lacking, 0.0, values) * scale).astype(np.int64)
-        return np.where(lacking, MISSING, known)
+        # A float would round times of today, as it has 53 bits.
+        times = values.astype(np.int64) * int(scale) if whole else np.rint(values * scale)
+        return np.where(lacking, MISSING, np.where(lacking, 0, times).astype(np.int64))
 
     def labels(self, name: str | None, else_: str) -> tuple[tuple[str, ...], Any]:
         """Labels in order of appearance, and the number of each row's or ``MISSING``, (N,)."""
