@@ -9,6 +9,7 @@ which columns are what.
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -313,7 +314,7 @@ def dataset_of(
         arrays["time_ns"] = reader.times(columns.time, _UNITS["time"][columns.time_unit])
     names, arrays["sensor"] = reader.labels(columns.sensor, sensor or source.stem)
     for name in ("group", "block"):
-        _, arrays[name] = reader.labels(getattr(columns, name), "")
+        _, arrays[name] = reader.labels(getattr(columns, name), "", keep=True)
     rows = len(arrays["electrodes"])
     kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
     arrays = {name: array[kept] for name, array in arrays.items()}
@@ -411,8 +412,13 @@ class _Reader:
         times = values.astype(np.int64) * int(scale) if whole else np.rint(values * scale)
         return np.where(lacking, MISSING, np.where(lacking, 0, times).astype(np.int64))
 
-    def labels(self, name: str | None, else_: str) -> tuple[tuple[str, ...], Any]:
-        """Labels in order of appearance, and the number of each row's or ``MISSING``, (N,)."""
+    def labels(
+        self, name: str | None, else_: str, *, keep: bool = False
+    ) -> tuple[tuple[str, ...], Any]:
+        """Labels in order of appearance, and the number of each row's or ``MISSING``, (N,).
+
+        ``keep``: If all are whole numbers, these.
+        """
         if name is None:
             return (else_,), np.zeros(self._table.num_rows, np.int64)
         words = [
@@ -420,6 +426,8 @@ class _Reader:
             for value in self._found(name).to_pylist()
         ]
         numbers = {word: number for number, word in enumerate(dict.fromkeys(filter(None, words)))}
+        if keep and all(re.fullmatch("0|[1-9][0-9]{0,8}", word) for word in numbers):  # int32
+            numbers = {word: int(word) for word in numbers}
         return tuple(numbers), np.array([numbers.get(word, MISSING) for word in words], np.int64)
 
     def _found(self, name: str) -> Any:
@@ -565,26 +573,27 @@ def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
     return rest
 
 
+def _apart(*labels: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The last label of each row; another number where one is told apart by those before it."""
+    found, number = np.unique(labels, axis=1, return_inverse=True)
+    return labels[-1] if len(np.unique(found[-1])) == found.shape[1] else number.reshape(-1)
+
+
 def _groups(arrays: Mapping[str, Any], *, labelled: bool, across: bool) -> dict[str, Any]:
     """Group and block of each row: as labelled, or pieces of each sensor's rows.
 
     ``across``: A group may have rows of several sensors, which were pressed alike; to tell them
     apart would let the same press into training and test.
     """
-    apart = () if across else ("sensor",)
-    group, block = (
-        np.unique([arrays[name] for name in (*apart, *names)], axis=1, return_inverse=True)[
-            1
-        ].reshape(-1)
-        for names in (("group",), ("group", "block"))
-    )
-    single = 1 if across else len(np.unique(arrays["sensor"]))
-    if labelled or len(np.unique(group)) > single:
+    apart = () if across else (arrays["sensor"],)
+    group = _apart(*apart, arrays["group"])
+    block = _apart(*apart, arrays["group"], arrays["block"])
+    if labelled or len(np.unique(group)) > (1 if across else len(np.unique(arrays["sensor"]))):
         return {"group": group, "block": block}
-    for number in np.unique(group):
+    for place, number in enumerate(np.unique(group)):
         sensors, rows = np.unique(arrays["sensor"][group == number], return_counts=True)
         pieces = min(BLOCKS, *rows)
         for sensor, count in zip(sensors, rows, strict=True):  # pressed alike, so cut alike
             own = (group == number) & (arrays["sensor"] == sensor)
-            block[own] = BLOCKS * number + cut_into_blocks(count, pieces)
+            block[own] = BLOCKS * place + cut_into_blocks(count, pieces)
     return {"group": group, "block": block}
