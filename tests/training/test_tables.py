@@ -327,7 +327,10 @@ def test_lists_of_another_width_are_refused(data: FeatureDataset) -> None:
         ("electrodes = 'e'\nforce = 'f'\nvoltage = 'v'", "voltage"),
         ("electrodes = 'e'\nforce = 'f'\ntime_unit = 'h'", "time_unit"),
         ("electrodes = ", "map.toml"),
-        ("electrodes = ['E1', 'E2', 'E1']\nforce = 'f'", "map.toml: column 'E1' is named twice"),
+        (
+            "electrodes = ['E1', 'E2', 'E1']\nforce = 'f'",
+            "map.toml: keys: column 'E1' is named twice",
+        ),
         ("electrodes = 'e'\nforce = ['x', 'y', '-x']", "column 'x' is named twice"),
         ("electrodes = 'e'\nforce = 'f'\nrest = 'e'", "column 'e' is named twice"),
         ("electrodes = 'e'\nforce = 'f'\ntime = 't'\ngroup = 't'", "column 't' is named twice"),

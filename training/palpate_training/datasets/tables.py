@@ -158,10 +158,9 @@ class ColumnMap(BaseModel):
             raise ConfigError(f"{path}: {error}", remedy="see docs/data.md") from error
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            said = first["msg"].removeprefix("Value error, ")
+            where = ".".join(str(part) for part in first["loc"]) or "keys"
             raise ConfigError(
-                ": ".join(filter(None, (str(path), where, said))),
+                f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}",
                 remedy="electrodes and force must be there; all names: docs/data.md",
             ) from error
 
@@ -399,7 +398,7 @@ class _Reader:
         """Times [ns] or ``MISSING``, shape (N,); whole numbers and timestamps are not rounded."""
         column = self._found(name)
         if "timestamp" in str(column.type):  # which says its unit itself
-            known = self._cast(name, "timestamp[ns]", "times from 1678 to 2261", safe=True)
+            known = self._cast(name, "timestamp[ns]", "not times from 1678 to 2261", safe=True)
             column, scale = known.cast("int64"), 1.0
         whole = str(column.type).removeprefix("u").startswith("int")
         values = column.fill_null(0).to_numpy() if whole else self._column(name)
@@ -446,15 +445,18 @@ class _Reader:
     def _column(self, name: str) -> Values:
         """Numbers of one column, shape (N,); a minus before its name turns the sign."""
         plain = name.removeprefix("-") if name not in self._table.column_names else name
-        values = np.asarray(self._cast(plain, "float64", "numbers").to_numpy(), np.float64)
+        values = np.asarray(self._cast(plain, "float64", "not numbers").to_numpy(), np.float64)
         return values if plain == name else -values
 
-    def _cast(self, name: str, kind: str, wanted: str, *, safe: bool = False) -> Any:
+    def _cast(self, name: str, kind: str, other: str, *, safe: bool = False) -> Any:
         column = self._found(name)
         try:
             return column.cast(kind, safe=safe)
         except (ValueError, TypeError, NotImplementedError) as error:  # bases of Arrow's errors
-            raise self._other(name, wanted) from error
+            raise DatasetError(
+                f"{self._source}: column {name!r} holds {column.type}, {other}",
+                remedy="give numbers (for a time also timestamps), or name another column",
+            ) from error
 
     def _lists(self, name: str, width: int) -> Values:
         column = self._found(name)
@@ -468,13 +470,10 @@ class _Reader:
         try:
             return np.array(rows, np.float64)
         except (ValueError, TypeError) as error:  # of lists of text, or of lists
-            raise self._other(name, "lists of numbers") from error
-
-    def _other(self, name: str, wanted: str) -> DatasetError:
-        return DatasetError(
-            f"{self._source}: column {name!r} holds {self._found(name).type}, not {wanted}",
-            remedy="give numbers (for a time also timestamps), or name another column",
-        )
+            raise DatasetError(
+                f"{self._source}: column {name!r} holds {column.type}, not lists of numbers",
+                remedy="give numbers (for a time also timestamps), or name another column",
+            ) from error
 
     def _wrong(self, name: str, row: int, found: str, wanted: str) -> DatasetError:
         return DatasetError(
