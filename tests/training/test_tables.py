@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 from tests.training.invented_population import population
@@ -50,14 +51,9 @@ def test_a_table_comes_back_as_it_was(data: FeatureDataset, tmp_path: Path, csv:
     table = read_table(path)
     back = dataset_of(table, ColumnMap.ours(table.column_names), source=path)
     assert back.sensor_names == data.sensor_names
+    # Groups, too, for the same split with the same seed; those of several sensors stay together.
     for name, array in data.arrays().items():
-        if name not in ("group", "block"):
-            np.testing.assert_array_equal(getattr(back, name), array, err_msg=name)
-    for name in ("group", "block"):
-        # Those of several sensors stay together: they are the same press.
-        labels = np.stack([getattr(data, name), getattr(back, name)])
-        pairs = np.unique(labels, axis=1).T
-        assert len(pairs) == len(np.unique(labels[0])) == len(np.unique(labels[1]))
+        np.testing.assert_array_equal(getattr(back, name), array, err_msg=name)
     assert back.provenance.notes == "palpate's own columns"
     assert (back.provenance.source, back.provenance.licence) == ("invented", "free")
     with pytest.raises(DatasetError, match="exists"):
@@ -98,6 +94,28 @@ def test_a_strangers_table_is_read_by_a_map(data: FeatureDataset, tmp_path: Path
     np.testing.assert_array_equal(same, data.group[:, None] == data.group)
 
 
+def test_labels_in_csv_are_names(data: FeatureDataset, tmp_path: Path) -> None:
+    """Not numbers, of which "007" and "7" would be one, nor words for nothing."""
+    names = ("007", "7", "NA")
+    own, other = tmp_path / "own.csv", tmp_path / "other.csv"
+    export_table(own, replace(data, sensor_names=names), csv=True)
+    heading, rows = own.read_text().split("\n", 1)
+    other.write_text(
+        heading.replace('"sensor"', '"finger"').replace('"group"', '"press"') + "\n" + rows
+    )
+    ours = ColumnMap.ours(read_table(own).column_names)
+    for path, columns in (
+        (own, ours),
+        (other, ours.model_copy(update={"sensor": "finger", "group": "press"})),
+    ):
+        back = dataset_of(read_table(path, columns), columns, source=path)
+        assert back.sensor_names == names
+        np.testing.assert_array_equal(back.sensor, data.sensor)
+    other.write_text(own.read_text().replace('"NA"', '""'))
+    with pytest.raises(DatasetError, match=f"sensor is not known in row {data.sensor.argmax()}"):
+        dataset_of(read_table(other), ours, source=other)
+
+
 def test_without_groups_a_file_is_cut_into_blocks(data: FeatureDataset) -> None:
     table = table_of(data).drop_columns(["group", "block", "sensor"])
     back = dataset_of(table, ColumnMap.ours(table.column_names), source=Path("x.csv"))
@@ -106,14 +124,111 @@ def test_without_groups_a_file_is_cut_into_blocks(data: FeatureDataset) -> None:
     assert (np.diff(back.block) >= 0).all()
 
 
+def test_whole_numbers_of_groups_are_kept_where_they_tell_presses_apart() -> None:
+    known = population(specimens=2, presses=6, each=2)
+    numbers = (known.group * 7 + 3) * 2 + known.sensor  # each of one sensor, in no order
+    names = table_of(known).column_names
+    columns = ColumnMap.ours(names).model_copy(update={"block": None})
+
+    def read(labels: list[Any]) -> FeatureDataset:
+        place = names.index("group")
+        table = table_of(known).set_column(place, "group", pa.array(labels))
+        return dataset_of(table, columns, source=Path("x"))
+
+    kept = read(list(numbers))
+    np.testing.assert_array_equal(kept.group, numbers)
+    same_press(kept.block, numbers)
+    for other in (
+        read([f"0{number}" for number in numbers]),  # "07" and "7" would be one
+        read([int(number) + 10**9 for number in numbers]),  # a file holds 31 bits
+        read([int(number) - 3 for number in numbers - numbers.max()]),
+    ):
+        same_press(other.group, numbers)
+        assert set(other.group) == set(range(len(np.unique(numbers))))
+    shared = read(list(known.group))  # a press of each sensor
+    same_press(shared.group, numbers)
+
+
+def test_a_press_of_several_sensors_is_one_if_the_map_says_so(data: FeatureDataset) -> None:
+    """Else it could be learned from on one sensor and tested with on another."""
+    names = [
+        {"group": "press", "block": "piece"}.get(name, name) for name in table_of(data).column_names
+    ]
+    table = table_of(data).rename_columns(names)
+    columns = ColumnMap.ours(names).model_copy(update={"group": "press"})
+    apart = dataset_of(table, columns, source=Path("x"))
+    same_press(apart.group, data.group * 10 + data.sensor)
+    alike = columns.model_copy(update={"groups_across_sensors": True})
+    together = dataset_of(table, alike, source=Path("x"))
+    same_press(together.group, data.group)
+    same_press(together.block, data.group)
+    single = table.set_column(names.index("press"), "press", pa.array(["only"] * len(data)))
+    cut = dataset_of(single, alike, source=Path("x"))
+    assert len(np.unique(cut.group)) == 1
+    for sensor in range(3):  # each from its beginning to its end
+        own = cut.block[cut.sensor == sensor]
+        assert list(np.unique(own)) == list(range(cut.block.max() + 1))
+        assert (np.diff(own) >= 0).all()
+
+
+def no_rest(table: pa.Table) -> pa.Table:
+    """A table of which somebody subtracted the rest."""
+    for name in columns_of("baseline"):
+        place = table.column_names.index(name)
+        table = table.set_column(place, name, pa.array(np.zeros(len(table))))
+    return table
+
+
+def test_timestamps_are_taken_as_they_are(data: FeatureDataset, tmp_path: Path) -> None:
+    """Whatever the unit of the column is, or the map says."""
+    assert data.time_ns is not None
+    stamps = pa.array(data.time_ns).cast(pa.timestamp("ns"))
+    table = table_of(data)
+    place = table.column_names.index("time_ns")
+    columns = ColumnMap.ours(table.column_names).model_copy(update={"time_unit": "s"})
+    for kind in ("timestamp[ns]", "timestamp[ms]", pa.timestamp("us", "Europe/Berlin")):
+        stamped = table.set_column(place, "time_ns", stamps.cast(kind))
+        back = dataset_of(stamped, columns, source=Path("x"))
+        np.testing.assert_array_equal(back.time_ns, data.time_ns)
+    pyarrow.csv.write_csv(stamped, tmp_path / "stamped.csv")
+    back = dataset_of(read_table(tmp_path / "stamped.csv"), columns, source=Path("x"))
+    np.testing.assert_array_equal(back.time_ns, data.time_ns)
+
+
+@pytest.mark.parametrize(("unit", "ns"), [("us", 10**3), ("ms", 10**6), ("s", 10**9)])
+def test_whole_times_are_not_rounded(data: FeatureDataset, unit: str, ns: int) -> None:
+    whole = (10**18 + 10**9 + 7 * 10**3) // ns + np.arange(len(data))
+    table = table_of(data)
+    place = table.column_names.index("time_ns")
+    columns = ColumnMap.ours(table.column_names).model_copy(update={"time_unit": unit})
+    for kind in (np.int64, np.uint64):
+        times = pa.array(whole.astype(kind))
+        back = dataset_of(table.set_column(place, "time_ns", times), columns, source=Path("x"))
+        assert back.time_ns is not None
+        np.testing.assert_array_equal(back.time_ns, whole * ns)
+    lacking = lack(table.set_column(place, "time_ns", times), "time_ns")
+    with pytest.raises(DatasetError, match="time_ns is not known in row 4"):
+        dataset_of(lacking, columns, source=Path("x"))
+    far = table.set_column(place, "time_ns", pa.array(np.full(len(data), 2**63, np.uint64)))
+    with pytest.raises(DatasetError, match=r"holds 9\.22337e\+18 in row 0, not a time"):
+        dataset_of(far, columns, source=Path("x"))
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
+        (lambda rows: of_type(rows, "time_ns", pa.duration("ns")), r"'time_ns' holds duration"),
+        (lambda rows: of_type(rows, "time_ns", pa.timestamp("s")), "not times from 1678 to 2261"),
+        (lambda rows: of_type(rows, "force_x_n", pa.timestamp("s")), "'force_x_n' holds timestamp"),
+        (lambda rows: put(rows, "time_ns", "noon"), "'time_ns' holds string, not numbers"),
         (lambda rows: rows.drop_columns(["electrode_7"]), "no column 'electrode_7'"),
         (lambda rows: rows.drop_columns(columns_of("baseline")), "untouched"),
         (lambda rows: put(rows, "electrode_3", 17.5), r"E3 reads 17\.5 in row 4"),
         (lambda rows: put(rows, "electrode_3", 4096.0), r"E3 reads 4096 in row 4"),
         (lambda rows: put(rows, "electrode_3", float("nan")), "electrodes is not known in row 4"),
+        (lambda rows: put(rows, "rest_3", -5.0), r"rest of E3 is -5 in row 4"),
+        (lambda rows: put(rows, "rest_3", 1e9), r"rest of E3 is 1e\+09 in row 4"),
+        (no_rest, r"rest of E1 is 0 in row 0"),
         (lambda rows: put(rows, "force_z_n", float("inf")), "force is not known in row 4"),
         (lambda rows: put(rows, "in_contact", 3.0), "'in_contact' holds 3 in row 4"),
         (lambda rows: put(rows, "in_contact", None), "in_contact is not known in row 4"),
@@ -134,6 +249,12 @@ def test_a_wrong_table_is_refused(data: FeatureDataset, change: object, says: st
     table = change(table_of(data))  # type: ignore[operator]
     with pytest.raises(DatasetError, match=says):
         dataset_of(table, ColumnMap.ours(table.column_names), source=Path("lab.csv"))
+
+
+def of_type(table: pa.Table, name: str, kind: pa.DataType) -> pa.Table:
+    """A table with one column of another type."""
+    values = table.column(name).cast("int64", safe=False).cast(kind)
+    return table.set_column(table.column_names.index(name), name, values)
 
 
 def lack(table: pa.Table, name: str) -> pa.Table:
@@ -188,6 +309,11 @@ def test_lists_of_another_width_are_refused(data: FeatureDataset) -> None:
     columns = ColumnMap(electrodes="skin", force=columns_of("force"), rest_rows=3)
     with pytest.raises(DatasetError, match=r"'skin' holds 18 numbers in row 3, not 19"):
         dataset_of(table, columns, source=Path("x"))
+    words = table.set_column(
+        len(table.column_names) - 1, "skin", pa.array([["a"] * 19] * len(skin))
+    )
+    with pytest.raises(DatasetError, match=r"'skin' holds list<.*string>, not lists of numbers"):
+        dataset_of(words, columns, source=Path("x"))
     short = columns.model_copy(update={"electrodes": ["electrode_1", "electrode_2"]})
     with pytest.raises(DatasetError, match=r"2 columns are named from 'electrode_1' on, not 19"):
         dataset_of(table, short, source=Path("x"))
@@ -201,6 +327,15 @@ def test_lists_of_another_width_are_refused(data: FeatureDataset) -> None:
         ("electrodes = 'e'\nforce = 'f'\nvoltage = 'v'", "voltage"),
         ("electrodes = 'e'\nforce = 'f'\ntime_unit = 'h'", "time_unit"),
         ("electrodes = ", "map.toml"),
+        (
+            "electrodes = ['E1', 'E2', 'E1']\nforce = 'f'",
+            "map.toml: keys: column 'E1' is named twice",
+        ),
+        ("electrodes = 'e'\nforce = ['x', 'y', '-x']", "column 'x' is named twice"),
+        ("electrodes = 'e'\nforce = 'f'\nrest = 'e'", "column 'e' is named twice"),
+        ("electrodes = 'e'\nforce = 'f'\ntime = 't'\ngroup = 't'", "column 't' is named twice"),
+        ("electrodes = 'e'\nforce = 'f'\nrest = 'r'\nrest_rows = 3", "rest and rest_rows"),
+        ("electrodes = 'e'\nforce = 'f'\ngroups_across_sensors = true", "without group"),
     ],
 )
 def test_a_wrong_map_is_refused(tmp_path: Path, text: str, says: str) -> None:
@@ -261,6 +396,35 @@ def test_a_lerobot_dataset_has_episodes_at_an_even_rate(
         export_lerobot(tmp_path / "set", data)
 
 
+def test_a_lerobot_dataset_of_ours_comes_back_without_a_map(
+    data: FeatureDataset, tmp_path: Path
+) -> None:
+    """Also where an episode ends within a press, as a row is missing."""
+    assert data.time_ns is not None
+    times = data.time_ns.copy()
+    times[4:] += 3 * STEP_NS
+    gapped = replace(data, time_ns=times)
+    write_dataset(tmp_path / "rows.h5", gapped)
+    for arguments in (
+        ["export", str(tmp_path / "rows.h5"), str(tmp_path / "set"), "--lerobot"],
+        ["import", str(tmp_path / "set"), str(tmp_path / "back.h5")],
+    ):
+        result = CliRunner().invoke(data_app, arguments, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    back = open_dataset(tmp_path / "back.h5")
+    assert back.sensor_names == data.sensor_names
+    assert back.content_sha256() == gapped.content_sha256()
+    features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
+    kinds = {name: features[name]["dtype"] for name in ("sensor", "group", "block", "in_contact")}
+    assert kinds == {"sensor": "string", "group": "int64", "block": "int64", "in_contact": "bool"}
+
+
+def same_press(labels: np.ndarray, known: np.ndarray) -> None:
+    """Two numberings tell the same rows apart."""
+    pairs = np.unique(np.stack([labels, known]), axis=1).T
+    assert len(pairs) == len(np.unique(labels)) == len(np.unique(known))
+
+
 def test_a_lerobot_dataset_needs_a_rate(data: FeatureDataset, tmp_path: Path) -> None:
     timeless = replace(data, time_ns=None)
     with pytest.raises(DatasetError, match="--fps"):
@@ -293,9 +457,8 @@ def test_the_command_writes_each_form(data: FeatureDataset, tmp_path: Path) -> N
         assert result.exit_code == 0, result.output
         assert (tmp_path / name).exists()
         back = ["import", str(tmp_path / name), str(tmp_path / f"{name}.h5")]
-        if form != "--lerobot":
-            result = CliRunner().invoke(data_app, back, catch_exceptions=False)
-            assert result.exit_code == 0, result.output
+        result = CliRunner().invoke(data_app, back, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
     for wrong in (["--published"], [], ["--csv", "--lerobot"]):
         arguments = ["export", str(tmp_path / "rows.h5"), str(tmp_path / "b"), *wrong]
         with pytest.raises(ConfigError):

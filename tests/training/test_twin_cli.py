@@ -145,11 +145,14 @@ def test_features_can_be_read_for_training(path: Path, tmp_path: Path) -> None:
 
 
 def test_features_of_published_files_need_an_assumed_rest(
-    experiment: ExperimentDataset, tmp_path: Path
+    experiment: ExperimentDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("sys.argv", ["/usr/bin/palpate", "data", "features", "out", "f.h5"])
     export_published(tmp_path / "out", experiment)
     refused = _run("features", tmp_path / "out", tmp_path / "f.h5")
     assert isinstance(refused.exception, DatasetError)
     done = _run("features", tmp_path / "out", tmp_path / "f.h5", "--assumed-rest", 3300)
     assert done.exit_code == 0, done.output
-    assert (open_dataset(tmp_path / "f.h5").baseline == 3300).all()
+    rows = open_dataset(tmp_path / "f.h5")
+    assert (rows.baseline == 3300).all()
+    assert rows.provenance.command == "palpate data features out f.h5"

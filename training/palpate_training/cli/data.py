@@ -147,11 +147,11 @@ def data_import(
 
     palpate data import presses.csv presses.h5 --columns map.toml
     """
-    table = read_lerobot(source) if source.is_dir() else read_table(source)
-    found = ColumnMap.read(columns) if columns else ColumnMap.ours(table.column_names)
+    told = ColumnMap.read(columns) if columns else None
+    table = read_lerobot(source) if source.is_dir() else read_table(source, told)
     data = dataset_of(
         table,
-        found,
+        told or ColumnMap.ours(table.column_names),
         source=source,
         sensor=sensor,
         licence=licence,
@@ -237,7 +237,10 @@ def data_features(
     for path in paths:
         _, data = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
         part = features(data, untouched_rows=untouched_rows, assumed_rest=assumed_rest)
-        parts.append(replace(part, name=str(path)))
+        # Published files do not say what made them, so these rows begin here.
+        made_by = part.provenance.command or typed_command()
+        provenance = replace(part.provenance, command=made_by)
+        parts.append(replace(part, name=str(path), provenance=provenance))
     rows = parts[0] if len(parts) == 1 else joined(parts, command=typed_command())
     write_dataset(out, rows)
     console.print(contents(rows, str(out)))

@@ -6,7 +6,8 @@ for each feature, ``meta/info.json``, ``meta/stats.json``, ``meta/tasks.parquet`
 versions 2 and 3, in order.
 
 An episode is a run of rows of one press at an even rate: LeRobot computes times from the number of
-a frame, and refuses others. The true time of a row stays in the feature ``time_ns``.
+a frame, and refuses others. The true time of a row stays in the feature ``time_ns``, its finger in
+``sensor``, its press in ``group`` and ``block``.
 """
 
 from __future__ import annotations
@@ -23,23 +24,13 @@ from palpate.errors import DatasetError
 from palpate.process import require
 from palpate_training.datasets.export import written_new
 from palpate_training.datasets.features import ELECTRODES, FeatureDataset
-from palpate_training.datasets.tables import METADATA, facts_of, read_table
+from palpate_training.datasets.tables import LISTS, METADATA, facts_of, read_table
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = "v3.0"
 TASK = "press the finger"
-
-FEATURES = {
-    "electrodes": "observation.electrodes",
-    "baseline": "observation.electrodes_at_rest",
-    "force": "observation.force",
-    "contact_location": "observation.contact_location",
-    "centre_of_pressure": "observation.centre_of_pressure",
-    "contact_normal": "observation.contact_normal",
-}
-"""Names of the features, by our arrays; all are float32."""
 
 _NAMES = {ELECTRODES: [f"E{number + 1}" for number in range(ELECTRODES)], 3: list("xyz")}
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -71,18 +62,21 @@ def export_lerobot(folder: Path, data: FeatureDataset, *, fps: float | None = No
     lengths = np.diff(np.append(starts, len(data)))
     frame = np.arange(len(data)) - np.repeat(starts, lengths)
     known = data.arrays()
-    lists = {FEATURES[name]: known[name].astype(np.float32) for name in FEATURES if name in known}
+    lists = {LISTS[name]: known[name].astype(np.float32) for name in LISTS if name in known}
     plain: dict[str, npt.NDArray[Any]] = {
         "timestamp": (frame / rate).astype(np.float32),
         "frame_index": frame.astype(np.int64),
         "episode_index": episode,
         "index": np.arange(len(data), dtype=np.int64),
         "task_index": np.zeros(len(data), np.int64),
+        "sensor": np.array(data.sensor_names, object)[data.sensor],
+        "group": data.group.astype(np.int64),
+        "block": data.block.astype(np.int64),
     }
-    if data.time_ns is not None:
-        plain["time_ns"] = data.time_ns
+    plain |= {name: known[name] for name in ("in_contact", "time_ns") if name in known}
     columns = {name: _lists(arrow, values) for name, values in lists.items()} | plain
-    stats = {name: _statistics(values) for name, values in (lists | plain).items()}
+    numbers = {name: values for name, values in plain.items() if values.dtype != object}
+    stats = {name: _statistics(values) for name, values in (lists | numbers).items()}
 
     def write(part: Path) -> None:
         place = part / _DATA.format(chunk_index=0, file_index=0)
@@ -226,7 +220,11 @@ def _info(
         name: {"dtype": "float32", "shape": [values.shape[1]], "names": _NAMES[values.shape[1]]}
         for name, values in lists.items()
     } | {
-        name: {"dtype": str(values.dtype), "shape": [1], "names": None}
+        name: {
+            "dtype": "string" if values.dtype == object else str(values.dtype),
+            "shape": [1],
+            "names": None,
+        }
         for name, values in plain.items()
     }
     return {

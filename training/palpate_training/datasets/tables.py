@@ -9,15 +9,17 @@ which columns are what.
 from __future__ import annotations
 
 import json
+import re
 import tomllib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from palpate import __version__
 from palpate.errors import ConfigError, DatasetError
@@ -28,6 +30,7 @@ from palpate_training.datasets.export import written_new
 from palpate_training.datasets.features import (
     ELECTRODES,
     FEATURE_COLUMNS,
+    OF_CONTACT,
     FeatureDataset,
     cut_into_blocks,
 )
@@ -43,6 +46,9 @@ BLOCKS = 20
 PROVENANCE_COLUMNS = ("source", "licence")
 """Columns of a CSV file of ours that say the same in every row."""
 
+LABELS = ("sensor", "group", "block")
+"""Keys of a map, and columns of ours, that hold names."""
+
 MISSING = np.iinfo(np.int64).min
 """Stands for a time, a label or a truth that a row lacks."""
 
@@ -54,6 +60,16 @@ _STEMS = {
     "contact_location": ("contact_location", "_m"),
     "centre_of_pressure": ("centre_of_pressure", "_m"), "contact_normal": ("contact_normal", ""),
 }  # fmt: skip
+LISTS = {
+    "electrodes": "observation.electrodes",
+    "baseline": "observation.electrodes_at_rest",
+    "force": "observation.force",
+    "contact_location": "observation.contact_location",
+    "centre_of_pressure": "observation.centre_of_pressure",
+    "contact_normal": "observation.contact_normal",
+}
+"""Names of a LeRobotDataset's features that hold a list, by our arrays."""
+
 _UNITS = {
     "force": {"N": 1.0, "mN": 1e-3},
     "length": {"m": 1.0, "mm": 1e-3},
@@ -82,12 +98,14 @@ class ColumnMap(BaseModel):
         in_contact: Whether something touches, true or false, or 0 or 1.
         time: Of the row.
         group: Press or episode.
+        groups_across_sensors: The same label on several sensors is one press, as of simulated ones
+            that were pressed alike; else each sensor has a press of its own.
         block: Piece of a group that is held out as a whole; none = the group, or where each sensor
             has but one, twenty pieces of it.
         sensor: Name of the BioTac.
         force_unit: N or mN.
         length_unit: m or mm.
-        time_unit: s, ms, us or ns.
+        time_unit: s, ms, us or ns, of times that are numbers; timestamps say theirs.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -102,11 +120,30 @@ class ColumnMap(BaseModel):
     in_contact: str | None = None
     time: str | None = None
     group: str | None = None
+    groups_across_sensors: bool = False
     block: str | None = None
     sensor: str | None = None
     force_unit: Literal["N", "mN"] = "N"
     length_unit: Literal["m", "mm"] = "m"
     time_unit: Literal["s", "ms", "us", "ns"] = "s"
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        """Refuse a column in two places, and keys that contradict."""
+        if self.rest is not None and self.rest_rows is not None:
+            raise ValueError("rest and rest_rows are both there: give one of them")
+        if self.groups_across_sensors and self.group is None:
+            raise ValueError("groups_across_sensors is there without group: name its column")
+        keys = ("electrodes", "rest", "force", *OF_CONTACT, "in_contact", "time")
+        told = [names for key in keys if (names := getattr(self, key)) is not None]
+        numbers = [
+            name for names in told for name in ([names] if isinstance(names, str) else names)
+        ]
+        labels = {getattr(self, name) for name in LABELS} - {None}  # may share a column
+        counted = Counter(name.removeprefix("-") for name in (*numbers, *labels))
+        if repeated := [name for name, times in counted.items() if times > 1]:
+            raise ValueError(f"column {repeated[0]!r} is named twice: each holds one thing")
+        return self
 
     @classmethod
     def read(cls, path: Path) -> ColumnMap:
@@ -121,20 +158,22 @@ class ColumnMap(BaseModel):
             raise ConfigError(f"{path}: {error}", remedy="see docs/data.md") from error
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
+            where = ".".join(str(part) for part in first["loc"]) or "keys"
             raise ConfigError(
-                f"{path}: {where}: {first['msg']}",
+                f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}",
                 remedy="electrodes and force must be there; all names: docs/data.md",
             ) from error
 
     @classmethod
     def ours(cls, columns: Sequence[str]) -> ColumnMap:
         """Of a table with palpate's own names, as far as it has them."""
-        known = {
+        known: dict[str, Columns] = {
             name: names
             for name in _STEMS
             if set(names := columns_of(name)) <= set(columns) or name in ("electrodes", "force")
         }
+        if {LISTS["electrodes"], LISTS["force"], *LABELS} <= set(columns):  # LeRobot's, by us
+            known = {name: column for name, column in LISTS.items() if column in columns}
         rest = known.pop("baseline", None)
         single = {
             name: name for name in ("in_contact", "group", "block", "sensor") if name in columns
@@ -200,8 +239,13 @@ def export_table(path: Path, data: FeatureDataset, *, csv: bool = False) -> None
     written_new(path, write)
 
 
-def read_table(path: Path) -> pa.Table:
+def read_table(path: Path, columns: ColumnMap | None = None) -> pa.Table:
     """Read a CSV or Parquet file whole.
+
+    Args:
+        path: Of the file.
+        columns: Which are labels: in CSV they stay the text that they are, as "007" and "7" are two
+            fingers; None = palpate's own names.
 
     Raises:
         DatasetError: It is missing, or neither.
@@ -211,9 +255,13 @@ def read_table(path: Path) -> pa.Table:
     import pyarrow.csv
     import pyarrow.parquet
 
+    names = LABELS if columns is None else [getattr(columns, name) for name in LABELS]
+    labels = pyarrow.csv.ConvertOptions(
+        column_types={name: arrow.string() for name in names if name}
+    )
     try:
         if path.suffix.lower() == ".csv":
-            return pyarrow.csv.read_csv(path)
+            return pyarrow.csv.read_csv(path, convert_options=labels)
         return pyarrow.parquet.read_table(path)
     except (OSError, arrow.ArrowException) as error:
         raise DatasetError(
@@ -245,8 +293,8 @@ def dataset_of(
 
     Raises:
         DatasetError: A column is missing, there twice, of another width, or holds something else; a
-            number is missing; electrodes are no whole counts; nothing says what electrodes read
-            untouched; rows of a press are not in order of time.
+            number is missing; electrodes are no whole counts, the rest no counts; nothing says what
+            electrodes read untouched; rows of a press are not in order of time.
     """
     reader = _Reader(table, source)
     arrays: dict[str, Any] = {
@@ -265,14 +313,17 @@ def dataset_of(
         arrays["time_ns"] = reader.times(columns.time, _UNITS["time"][columns.time_unit])
     names, arrays["sensor"] = reader.labels(columns.sensor, sensor or source.stem)
     for name in ("group", "block"):
-        _, arrays[name] = reader.labels(getattr(columns, name), "")
+        _, arrays[name] = reader.labels(getattr(columns, name), "", keep=True)
     rows = len(arrays["electrodes"])
     kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
     arrays = {name: array[kept] for name, array in arrays.items()}
     arrays["electrodes"] = _counts(arrays["electrodes"], np.flatnonzero(kept), source)
-    if "baseline" not in arrays:
+    if "baseline" in arrays:
+        _check_rest(arrays["baseline"], np.flatnonzero(kept), source)
+    else:
         arrays["baseline"] = _rest(arrays, columns.rest_rows, source)
-    across = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
+    ours = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
+    across = columns.groups_across_sensors or ours
     arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
     if "time_ns" in arrays:
         _check_order(arrays, np.flatnonzero(kept), source)
@@ -344,21 +395,29 @@ class _Reader:
         return np.where(lacking, MISSING, values == 1.0)
 
     def times(self, name: str, scale: float) -> npt.NDArray[np.int64]:
-        """Times [ns] or ``MISSING``, shape (N,); whole numbers are not rounded."""
+        """Times [ns] or ``MISSING``, shape (N,); whole numbers and timestamps are not rounded."""
         column = self._found(name)
-        if scale == 1.0 and str(column.type) in ("int64", "uint64", "int32", "uint32"):
-            whole = np.asarray(column.fill_null(0).to_numpy(), np.int64)
-            return np.where(column.is_null().to_numpy(), MISSING, whole)
-        values = self._column(name)
-        lacking = np.isnan(values)
-        wrong = np.flatnonzero(~(np.abs(values * scale) < 2.0**63) & ~lacking)
+        if "timestamp" in str(column.type):  # which says its unit itself
+            known = self._cast(name, "timestamp[ns]", "not times from 1678 to 2261", safe=True)
+            column, scale = known.cast("int64"), 1.0
+        whole = str(column.type).removeprefix("u").startswith("int")
+        values = column.fill_null(0).to_numpy() if whole else self._column(name)
+        lacking = column.is_null().to_numpy() if whole else np.isnan(values)
+        most = (2**63 - 1) // int(scale)
+        wrong = np.flatnonzero(~((values > -most) & (values < most)) & ~lacking)
         if wrong.size:
             raise self._wrong(name, int(wrong[0]), f"{values[wrong[0]]:g}", "a time")
-        known = np.rint(np.where(lacking, 0.0, values) * scale).astype(np.int64)
-        return np.where(lacking, MISSING, known)
+        # A float would round times of today, as it has 53 bits.
+        times = values.astype(np.int64) * int(scale) if whole else np.rint(values * scale)
+        return np.where(lacking, MISSING, np.where(lacking, 0, times).astype(np.int64))
 
-    def labels(self, name: str | None, else_: str) -> tuple[tuple[str, ...], Any]:
-        """Labels in order of appearance, and the number of each row's or ``MISSING``, (N,)."""
+    def labels(
+        self, name: str | None, else_: str, *, keep: bool = False
+    ) -> tuple[tuple[str, ...], Any]:
+        """Labels in order of appearance, and the number of each row's or ``MISSING``, (N,).
+
+        ``keep``: If all are whole numbers, these.
+        """
         if name is None:
             return (else_,), np.zeros(self._table.num_rows, np.int64)
         words = [
@@ -366,6 +425,8 @@ class _Reader:
             for value in self._found(name).to_pylist()
         ]
         numbers = {word: number for number, word in enumerate(dict.fromkeys(filter(None, words)))}
+        if keep and all(re.fullmatch("0|[1-9][0-9]{0,8}", word) for word in numbers):  # int32
+            numbers = {word: int(word) for word in numbers}
         return tuple(numbers), np.array([numbers.get(word, MISSING) for word in words], np.int64)
 
     def _found(self, name: str) -> Any:
@@ -384,15 +445,18 @@ class _Reader:
     def _column(self, name: str) -> Values:
         """Numbers of one column, shape (N,); a minus before its name turns the sign."""
         plain = name.removeprefix("-") if name not in self._table.column_names else name
-        column = self._found(plain)
-        try:
-            values = np.asarray(column.cast("float64", safe=False).to_numpy(), np.float64)
-        except (ValueError, TypeError) as error:  # of Arrow: its base is ValueError or TypeError
-            raise DatasetError(
-                f"{self._source}: column {plain!r} holds {column.type}, not numbers",
-                remedy="name another column",
-            ) from error
+        values = np.asarray(self._cast(plain, "float64", "not numbers").to_numpy(), np.float64)
         return values if plain == name else -values
+
+    def _cast(self, name: str, kind: str, other: str, *, safe: bool = False) -> Any:
+        column = self._found(name)
+        try:
+            return column.cast(kind, safe=safe)
+        except (ValueError, TypeError, NotImplementedError) as error:  # bases of Arrow's errors
+            raise DatasetError(
+                f"{self._source}: column {name!r} holds {column.type}, {other}",
+                remedy="give numbers (for a time also timestamps), or name another column",
+            ) from error
 
     def _lists(self, name: str, width: int) -> Values:
         column = self._found(name)
@@ -403,7 +467,13 @@ class _Reader:
             if row is None or len(row) != width:
                 size = "nothing" if row is None else f"{len(row)} numbers"
                 raise self._wrong(name, number, size, f"{width} numbers")
-        return np.array(rows, np.float64)
+        try:
+            return np.array(rows, np.float64)
+        except (ValueError, TypeError) as error:  # of lists of text, or of lists
+            raise DatasetError(
+                f"{self._source}: column {name!r} holds {column.type}, not lists of numbers",
+                remedy="give numbers (for a time also timestamps), or name another column",
+            ) from error
 
     def _wrong(self, name: str, row: int, found: str, wanted: str) -> DatasetError:
         return DatasetError(
@@ -470,6 +540,19 @@ def _counts(values: Values, rows: npt.NDArray[np.int64], source: Path) -> Values
     return np.asarray(counts)
 
 
+def _check_rest(rest: Values, rows: npt.NDArray[np.int64], source: Path) -> None:
+    """Refuse untouched counts that no BioTac sends; ``rows`` are those of the table."""
+    bad = (rest < 0.0) | (rest > COUNTS_MAX)
+    bad |= ~rest.any(axis=1, keepdims=True)  # of counts from which the rest was subtracted
+    if bad.any():
+        row, electrode = (int(index) for index in np.argwhere(bad)[0])
+        raise DatasetError(
+            f"{source}: the rest of E{electrode + 1} is {rest[row, electrode]:g} in row"
+            f" {rows[row]}, not untouched counts (0 to {COUNTS_MAX}, not all 0)",
+            remedy="give raw counts of the untouched BioTac, nothing subtracted or scaled",
+        )
+
+
 def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
     """Untouched counts of each row: the mean of the first rows of its sensor."""
     if rows is None:
@@ -489,23 +572,27 @@ def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
     return rest
 
 
+def _apart(*labels: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The last label of each row; another number where one is told apart by those before it."""
+    found, number = np.unique(labels, axis=1, return_inverse=True)
+    return labels[-1] if len(np.unique(found[-1])) == found.shape[1] else number.reshape(-1)
+
+
 def _groups(arrays: Mapping[str, Any], *, labelled: bool, across: bool) -> dict[str, Any]:
     """Group and block of each row: as labelled, or pieces of each sensor's rows.
 
     ``across``: A group may have rows of several sensors, which were pressed alike; to tell them
     apart would let the same press into training and test.
     """
-    apart = () if across else ("sensor",)
-    group, block = (
-        np.unique([arrays[name] for name in (*apart, *names)], axis=1, return_inverse=True)[
-            1
-        ].reshape(-1)
-        for names in (("group",), ("group", "block"))
-    )
-    if labelled or group.max() > arrays["sensor"].max():
+    apart = () if across else (arrays["sensor"],)
+    group = _apart(*apart, arrays["group"])
+    block = _apart(*apart, arrays["group"], arrays["block"])
+    if labelled or len(np.unique(group)) > (1 if across else len(np.unique(arrays["sensor"]))):
         return {"group": group, "block": block}
-    for number in np.unique(group):
-        own = np.flatnonzero(group == number)
-        pieces = min(BLOCKS, len(own))
-        block[own] = BLOCKS * number + cut_into_blocks(len(own), pieces)
+    for place, number in enumerate(np.unique(group)):
+        sensors, rows = np.unique(arrays["sensor"][group == number], return_counts=True)
+        pieces = min(BLOCKS, *rows)
+        for sensor, count in zip(sensors, rows, strict=True):  # pressed alike, so cut alike
+            own = (group == number) & (arrays["sensor"] == sensor)
+            block[own] = BLOCKS * place + cut_into_blocks(count, pieces)
     return {"group": group, "block": block}
