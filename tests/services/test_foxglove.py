@@ -128,9 +128,7 @@ def test_a_lost_electrode_is_not_shown_as_pressed(
         for name, message in (("tare", make_tare()), ("electrodes", lost)):
             codec = TOPICS[name].codec
             key = sensor_key("lab", "left", name)
-            writer.write(
-                key, codec.schema, codec.encode(message), log_time_ns=frame.stamp.wall_ns
-            )
+            writer.write(key, codec.schema, codec.encode(message), log_time_ns=frame.stamp.wall_ns)
     export_foxglove(path, tmp_path / "f.mcap")
     (scene,) = messages_of(tmp_path / "f.mcap")["/left/scene"]
     colours = [
