@@ -486,6 +486,24 @@ def test_leaving_a_router_that_hangs_ends_well(free_port: int, wait_until: WaitU
         router.wait()
 
 
+def test_joining_is_given_up_although_leaving_takes_long(
+    free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh takes 10 s to leave a router that hangs, also one that has never answered."""
+    told, left = threading.Event(), threading.Event()
+
+    def leave(session: zenoh.Session) -> None:
+        if told.wait(LIVE_S):
+            left.set()
+        close_zenoh(session)
+
+    monkeypatch.setattr("palpate.bus.link.close_zenoh", leave)
+    with pytest.raises(LinkError):
+        Client(f"tcp/127.0.0.1:{free_port}", timeout_s=0.1)
+    told.set()
+    assert left.wait(LIVE_S), "it was left before the error came"
+
+
 def test_a_session_that_does_not_close_is_given_up(caplog: pytest.LogCaptureFixture) -> None:
     class Hanging:
         def close(self) -> None:

@@ -65,6 +65,9 @@ _OBSERVER_WAIT_S = 1.0
 _LOOK_S = 1.0
 """How long a look at the tokens of others may take [s]."""
 
+_LEAVE_S = 1.0
+"""How long a session that found no router waits until it has left [s]."""
+
 _YOUNG_S = 2.0
 """Within this time the links of a session to all processes of its station have come up [s]."""
 
@@ -125,7 +128,10 @@ class Session(Closing):
             deadline = time.monotonic() + link.wait_for_router_s
             while not raw.info.routers_zid() and not raw.info.peers_zid():
                 if time.monotonic() > deadline:
-                    close_zenoh(raw)
+                    # Not out of the caller's time: where the router hangs, this takes 10 s.
+                    leaving = threading.Thread(target=close_zenoh, args=(raw,), name="leaving")
+                    leaving.start()
+                    leaving.join(_LEAVE_S)
                     raise no_router(link)
                 time.sleep(0.02)
         return cls(raw, station, link)
