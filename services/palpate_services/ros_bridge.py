@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from palpate.bus import Delivery, ForeignPublisher, Session, TapSample
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig
-from palpate.errors import StreamTimeout, WireError
+from palpate.errors import ConfigError, StreamTimeout, WireError
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
 from palpate.messages import FeatureEstimate, ServiceState, WrenchFrame
@@ -65,6 +65,7 @@ def run_ros_bridge(
     """Publish for ROS until ``stop`` is set.
 
     Raises:
+        ConfigError: Two of the sensors have one name in ROS.
         LinkError: The station's bus cannot be joined, or the router of ROS.
         MissingExtraError: ``rosbags`` is not installed.
     """
@@ -91,7 +92,11 @@ def run_ros_bridge(
                     sample = tap.next(_WAIT_S)
                 except StreamTimeout:
                     continue
-                health.count(bridge.pass_on(sample))
+                try:
+                    health.count(bridge.pass_on(sample))
+                except ConfigError as error:
+                    health.count("same_name")
+                    health.fail(error, degraded=False)  # the others go on
                 health.worked()
             presence.not_ready()
             health.set_state(ServiceState.STOPPING)
@@ -103,27 +108,34 @@ class RosBridge:
     Args:
         session: At the router that ROS uses.
         config: What to publish.
+
+    Raises:
+        ConfigError: Two of the sensors have one name in ROS.
     """
 
     def __init__(self, session: Session, config: RosBridgeConfig) -> None:
         self._session, self._config = session, config
+        self._sensors: dict[str, str] = {}
+        for sensor in config.sensors:
+            self._name_of(sensor)
         self._node = RosNode(session.zid, NODE, config.domain)
         self._node_token = session.foreign_token(self._node.token)
         self._publishers: dict[tuple[str, str], _RosPublisher] = {}
-        self._sensors: set[str] = set()
 
     def pass_on(self, sample: TapSample) -> str:
         """Publish what a message of the station holds; the counter that counts it.
 
         ``passed_on``, ``not_followed`` (of another sensor), ``rejected_...``.
+
+        Raises:
+            ConfigError: Its sensor has the name of another one in ROS; nothing is published.
         """
         wanted = self._config.sensors
         if wanted and sample.sensor not in wanted:
             return "not_followed"
-        if sample.sensor not in self._sensors:
-            if len(self._sensors) >= _SENSORS_MAX:
-                return "not_followed"
-            self._sensors.add(sample.sensor)
+        if sample.sensor not in self._sensors.values() and len(self._sensors) >= _SENSORS_MAX:
+            return "not_followed"
+        self._name_of(sample.sensor)
         topic = FEATURES if sample.topic == FEATURES.name else WRENCH
         try:
             message = topic.codec.decode(sample.payload)
@@ -135,15 +147,24 @@ class RosBridge:
             self._publisher(sample.sensor, output).put(payload)
         return "passed_on"
 
+    def _name_of(self, sensor: str) -> str:
+        """Name of a sensor in ROS, where names have no '-' and do not begin with a digit."""
+        name = sensor.replace("-", "_")
+        name = f"_{name}" if name[0].isdigit() else name
+        other = self._sensors.setdefault(name, sensor)
+        if other != sensor:
+            raise ConfigError(
+                f"sensors {other!r} and {sensor!r} would both be {name!r} in ROS",
+                remedy="rename one of them, or name the one to publish: ros_bridge.sensors",
+            )
+        return name
+
     def _publisher(self, sensor: str, output: RosOutput) -> _RosPublisher:
         known = self._publishers.get((sensor, output.name))
         if known is None:
             config = self._config
             hashed = NO_TYPE_HASH if config.humble else layouts.type_hash(output.layout)
-            # Names of ROS have no '-', and do not begin with a digit.
-            part = sensor.replace("-", "_")
-            part = f"_{part}" if part[0].isdigit() else part
-            name = f"{config.namespace}/{part}/{output.name}"
+            name = f"{config.namespace}/{self._name_of(sensor)}/{output.name}"
             topic = RosTopic(name, output.layout, hashed, config.domain)
             token = self._node.publisher_token(topic)
             gid = gid_of(token, GID_BYTES_HUMBLE if config.humble else GID_BYTES)

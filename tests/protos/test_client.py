@@ -50,6 +50,10 @@ LIVE_S = 20.0
 """Longest wait for what has to happen."""
 
 
+def _public(kind: type) -> set[str]:
+    return {name for name, _ in inspect.getmembers(kind, callable) if name[0] != "_"}
+
+
 class Finger:
     """Publishes features of ``finger`` 100 times a second, as a service does."""
 
@@ -329,6 +333,130 @@ def test_a_program_that_leaves_its_client_open_ends_well(link: LinkConfig, finge
         assert (result.returncode, result.stdout, result.stderr) == (0, "ends\n", "")
 
 
+_FORKS = """
+import os, signal, sys
+from palpate import Client
+from palpate.errors import LinkError
+
+def in_child(work):
+    child = os.fork()
+    if child:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    signal.alarm(60)  # a child that hangs is ended, which its exit code shows
+    work()
+    sys.exit(0)  # closes what it inherited
+
+def new():
+    return Client(sys.argv[1], timeout_s=20)
+
+def fresh():
+    with new() as robot:
+        robot.features("finger", max_age_s=20.0)
+
+def refused():
+    calls = (
+        new,
+        lambda: robot.features("finger", max_age_s=20.0),
+        lambda: robot.next_features("finger", timeout_s=20.0),
+        lambda: next(stream),
+        lambda: poses.put((0, 0, 0), (1, 0, 0, 0)),
+        lambda: robot.stream_wrench("finger"),
+        lambda: robot.tare("finger"),
+        robot.alive,
+        robot.census,
+        robot.model,
+        robot.session.observer,
+    )
+    for call in calls:
+        try:
+            call()
+        except LinkError as error:
+            assert "spawn" in error.remedy
+        else:
+            raise AssertionError(call)
+    robot.close()
+
+print("before", in_child(fresh), flush=True)
+robot = new()
+stream = robot.stream_features("finger", max_age_s=20.0)
+poses = robot.robot_pose_publisher("arm")
+next(stream), robot.features("finger", max_age_s=20.0), robot.next_features("finger")
+print("after", in_child(refused), flush=True)
+next(stream), robot.alive()
+print("ends")
+"""
+
+
+def test_a_fork_after_a_client_was_opened_is_refused_and_hangs_nowhere(
+    link: LinkConfig, finger: Finger
+) -> None:
+    """Zenoh's threads do not exist in the child, where every call waited for them for ever."""
+    result = subprocess.run(
+        [sys.executable, "-c", _FORKS, link.connect[0]],
+        capture_output=True,
+        text=True,
+        timeout=12 * LIVE_S,
+        check=False,
+    )
+    assert (result.stdout, result.stderr) == ("before 0\nafter 0\nends\n", "")
+
+
+_CALLS: dict[str, Callable[[Any, dict[str, Any]], object]] = {
+    "features": lambda robot, _: robot.features("finger"),
+    "electrodes": lambda robot, _: robot.electrodes("finger"),
+    "field": lambda robot, _: robot.field("finger"),
+    "synthesis": lambda robot, _: robot.synthesis("finger"),
+    "stream_features": lambda robot, _: robot.stream_features("finger"),
+    "stream_electrodes": lambda robot, _: robot.stream_electrodes("finger"),
+    "stream_field": lambda robot, _: robot.stream_field("finger"),
+    "stream_synthesis": lambda robot, _: robot.stream_synthesis("finger"),
+    "stream_wrench": lambda robot, _: robot.stream_wrench("finger"),
+    "estimate_features": lambda robot, of: robot.estimate_features("finger", of["ElectrodeFrame"]),
+    "estimate_field": lambda robot, of: robot.estimate_field("finger", of["ElectrodeFrame"]),
+    "field_basis": lambda robot, _: robot.field_basis(),
+    "synthesise": lambda robot, of: robot.synthesise(of["FieldFrame"]),
+    "synthesise_from": lambda robot, of: robot.synthesise_from(of["FieldFrame"]),
+    "next_features": lambda robot, _: robot.next_features("finger"),
+    "robot_pose_publisher": lambda robot, _: robot.robot_pose_publisher("arm"),
+    "tare": lambda robot, _: robot.tare("finger"),
+    "zero": lambda robot, _: robot.zero("finger"),
+    "simulate": lambda robot, _: robot.simulate(_request()),
+    "cancel_simulation": lambda robot, _: robot.cancel_simulation("r-1"),
+    "model": lambda robot, _: robot.model(),
+    "alive": lambda robot, _: robot.alive(),
+    "status": lambda robot, _: robot.status(),
+    "census": lambda robot, _: robot.census(),
+}
+"""Every call of a client, of its name."""
+
+
+@pytest.fixture(scope="module")
+def closed_robot(
+    router: Callable[[], AbstractContextManager[LinkConfig]],
+) -> Iterator[Client]:
+    with router() as link, Client(link.connect[0], timeout_s=LIVE_S) as robot:
+        robot.close()
+        yield robot
+
+
+@pytest.mark.parametrize("name", sorted(_public(Client) - {"close"}))
+def test_every_call_of_a_closed_client_says_that_it_is_closed(
+    closed_robot: Client, examples: dict[str, Any], name: str
+) -> None:
+    with pytest.raises(LinkError, match="closed") as caught:
+        _CALLS[name](closed_robot, examples)
+    assert caught.value.remedy
+
+
+def test_what_a_closed_client_has_made_says_that_it_is_closed(link: LinkConfig) -> None:
+    with Client(link.connect[0], timeout_s=LIVE_S) as robot:
+        poses = robot.robot_pose_publisher("arm")
+    with pytest.raises(LinkError, match="closed"):
+        poses.matched()
+    with pytest.raises(LinkError, match="closed"):
+        poses.put((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
 _ROUTER = """
 import sys, threading
 from palpate.bus import run_router
@@ -356,6 +484,24 @@ def test_leaving_a_router_that_hangs_ends_well(free_port: int, wait_until: WaitU
     finally:
         router.kill()
         router.wait()
+
+
+def test_joining_is_given_up_although_leaving_takes_long(
+    free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh takes 10 s to leave a router that hangs, also one that has never answered."""
+    told, left = threading.Event(), threading.Event()
+
+    def leave(session: zenoh.Session) -> None:
+        if told.wait(LIVE_S):
+            left.set()
+        close_zenoh(session)
+
+    monkeypatch.setattr("palpate.bus.link.close_zenoh", leave)
+    with pytest.raises(LinkError):
+        Client(f"tcp/127.0.0.1:{free_port}", timeout_s=0.1)
+    told.set()
+    assert left.wait(LIVE_S), "it was left before the error came"
 
 
 def test_a_session_that_does_not_close_is_given_up(caplog: pytest.LogCaptureFixture) -> None:
@@ -398,10 +544,20 @@ def test_router_and_station_may_come_from_the_environment(
 
 
 def test_every_method_of_the_client_is_there_for_asyncio() -> None:
-    def public(kind: type) -> set[str]:
-        return {name for name, _ in inspect.getmembers(kind, callable) if name[0] != "_"}
+    assert _public(Client) - {"close"} <= _public(AsyncClient)
 
-    assert public(Client) - {"close"} <= public(AsyncClient)
+
+@pytest.mark.parametrize("name", ["alive", "features", "tare"])
+def test_an_async_client_whose_session_is_closed_says_so(
+    link: LinkConfig, examples: dict[str, Any], name: str
+) -> None:
+    async def call() -> object:
+        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
+            robot.sync.close()
+            return await cast("Coroutine[Any, Any, object]", _CALLS[name](robot, examples))
+
+    with pytest.raises(LinkError, match="closed"):
+        asyncio.run(call())
 
 
 def test_an_async_client_streams_asks_and_leaves_the_loop_free(

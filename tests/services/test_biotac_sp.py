@@ -192,6 +192,25 @@ def test_a_lost_pac_sample_is_a_gap_in_the_picture(make_frame: Frames) -> None:
     assert scene.sensor_type is SP
 
 
+def test_a_lost_electrode_is_a_gap_in_the_picture(make_frame: Frames, make_tare: Tares) -> None:
+    """Its counts are 0: drawn as they are, they would be a press that did not happen."""
+    from palpate_services.viewer.timeline import SensorTimeline
+
+    frame = make_frame(sensor_type=SP)
+    frame = replace(frame, validity=frame.validity & ~(1 << 4))
+    scene = SensorTimeline()
+    scene.add(frame)
+    scene.add(make_tare(sensor_type=SP))
+    scene.add(frame)
+    rows = scene.take()
+    for kind in ("raw", "tared"):
+        (row,) = rows[f"electrodes/{kind}"]
+        assert np.flatnonzero(np.isnan(row.values)).tolist() == [4], kind
+        assert row.values.shape == (24,)
+        assert row.values.dtype == np.float32
+    assert not np.isnan(rows["pressure"][0].values).any()
+
+
 def test_the_extremes_of_a_frame_come_in_order_of_time() -> None:
     from palpate_services.viewer.record_view import _extremes
 

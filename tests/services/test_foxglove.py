@@ -118,6 +118,26 @@ def test_an_arrow_ends_where_the_finger_is_pressed(record: Path, tmp_path: Path)
         np.testing.assert_allclose(end, PLACE, atol=1e-6)
 
 
+def test_a_lost_electrode_is_not_shown_as_pressed(
+    make_frame: Frames, make_tare: Callable[..., Tare], tmp_path: Path
+) -> None:
+    path = tmp_path / "lab.mcap"
+    frame = make_frame(tare_id=5)
+    lost = dataclasses.replace(frame, validity=frame.validity & ~(1 << 4))
+    with RecordWriter(path) as writer:
+        for name, message in (("tare", make_tare()), ("electrodes", lost)):
+            codec = TOPICS[name].codec
+            key = sensor_key("lab", "left", name)
+            writer.write(key, codec.schema, codec.encode(message), log_time_ns=frame.stamp.wall_ns)
+    export_foxglove(path, tmp_path / "f.mcap")
+    (scene,) = messages_of(tmp_path / "f.mcap")["/left/scene"]
+    colours = [
+        np.array([ball.color.r, ball.color.g, ball.color.b]) for ball in scene.entities[0].spheres
+    ]
+    assert np.ptp(colours[4]) < 0.1, "grey"
+    assert max(colours[4]) < min(max(colour) for at, colour in enumerate(colours) if at != 4)
+
+
 def test_what_is_no_longer_there_is_deleted(record: Path, tmp_path: Path) -> None:
     export_foxglove(record, tmp_path / "f.mcap")
     scenes = messages_of(tmp_path / "f.mcap")["/right/scene"]

@@ -18,6 +18,7 @@ from palpate_services.viewer.layout import (
     TRUTH_COLOUR,
     SensorContents,
     electrode_colours,
+    electrode_shades,
     record_fixtures,
     record_layout,
 )
@@ -109,6 +110,17 @@ def test_electrodes_bear_their_numbers_in_the_colours_of_their_curves(kind: Sens
     assert [value >> 8 for value in packed] == [
         red << 16 | green << 8 | blue for red, green, blue in electrode_colours(count)
     ]
+
+
+def test_an_electrode_without_a_reading_is_neither_pressed_nor_at_rest() -> None:
+    tared = np.array([[np.nan, 0.0, -400.0], [400.0, np.nan, 0.0]], np.float32)
+    with np.errstate(all="raise"):
+        (lost, rest, pressed), (lifted, also_lost, _) = electrode_shades(tared).tolist()
+    assert lost == also_lost
+    assert len({lost, rest, pressed, lifted}) == 4
+    grey = [lost >> shift & 255 for shift in (24, 16, 8)]
+    assert max(grey) - min(grey) < 20
+    assert lost & 255 == 255
 
 
 def test_truth_is_seen_on_both_themes_and_beside_the_estimate() -> None:

@@ -16,11 +16,12 @@ import pytest
 import zenoh.ext
 from tests.protos.ros_idl import Features, PointStamped, WrenchStamped
 
+from palpate import Client
 from palpate.bus import ForeignSubscriber, Session
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError, StreamTimeout
-from palpate.messages import FeatureEstimate, Origin, QualityFlag, Stamp, WrenchFrame
+from palpate.messages import FeatureEstimate, Origin, QualityFlag, Stamp, Status, WrenchFrame
 from palpate.ros.layouts import DEFINITIONS
 from palpate.ros.layouts import FEATURES as FEATURES_LAYOUT
 from palpate_services.config import RosBridgeConfig
@@ -194,6 +195,41 @@ def test_only_chosen_sensors_go_out_and_the_tokens_go_with_the_bridge(
                 both["right"].next(0.2)
             until(lambda: len(outside.foreign_tokens("@ros2_lv/0/**")) == 4)
         until(lambda: not outside.foreign_tokens("@ros2_lv/0/**"))
+
+
+def test_two_sensors_with_one_name_in_ros_are_refused_at_the_start(link: LinkConfig) -> None:
+    config = parse_config(RosBridgeConfig, {"sensors": ("f-1", "f_1")}, where="test")
+    stop = threading.Event()
+    stop.set()
+    with pytest.raises(ConfigError, match="'f-1' and 'f_1'") as caught:
+        run_ros_bridge(config, link, "lab", stop)
+    assert "rename" in caught.value.remedy
+
+
+def test_a_later_sensor_of_a_taken_name_in_ros_is_not_mixed_in_and_told(
+    link: LinkConfig, until: Until
+) -> None:
+    with bridge(link, until) as session, Client(link.connect[0]) as robot:
+        force = session.foreign_subscriber("0/palpate/f_1/force/*/*")
+        first = session.publisher(FEATURES, sensor="f-1")
+        second = session.publisher(FEATURES, sensor="f_1")
+        assert received(session, {"force": force}, lambda: first.put(estimate()))
+
+        def status() -> Status:
+            (found,) = [one for one in robot.status() if one.service == "ros_bridge"]
+            return found
+
+        def told() -> bool:
+            second.put(estimate())
+            return status().counters.get("same_name", 0) > 0
+
+        until(told)
+        error = status().last_error
+        assert error is not None
+        assert "'f-1' and 'f_1'" in error.message
+        while force.waiting:
+            got = WrenchStamped.deserialize(force.next(0.0).payload)
+            assert got.header.frame_id == "f-1"
 
 
 def test_humble_has_no_type_hash(link: LinkConfig, until: Until) -> None:

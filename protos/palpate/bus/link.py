@@ -46,7 +46,13 @@ from palpate.bus.topics import (
     sensor_key,
     service_key,
 )
-from palpate.bus.zenoh_session import close_zenoh, open_zenoh
+from palpate.bus.zenoh_session import (
+    check_process,
+    close_zenoh,
+    is_inherited,
+    open_zenoh,
+    while_open,
+)
 from palpate.config import LinkConfig, check_name
 from palpate.errors import LinkError, PalpateError, WireError
 from palpate.process import Closing
@@ -58,6 +64,9 @@ _OBSERVER_WAIT_S = 1.0
 
 _LOOK_S = 1.0
 """How long a look at the tokens of others may take [s]."""
+
+_LEAVE_S = 1.0
+"""How long a session that found no router waits until it has left [s]."""
 
 _YOUNG_S = 2.0
 """Within this time the links of a session to all processes of its station have come up [s]."""
@@ -87,7 +96,8 @@ class Session(Closing):
     at its end are closed then.
 
     Methods take the name of a ``sensor`` for its topics and endpoints; for those of a process, the
-    names of its ``service`` and ``instance``. Where many can be meant, ``"*"`` stands for any.
+    names of its ``service`` and ``instance``. Where many can be meant, ``"*"`` stands for any. Each
+    raises a ``LinkError`` where the session is closed, or was opened before a fork of the process.
     """
 
     def __init__(self, raw: zenoh.Session, station: str, link: LinkConfig) -> None:
@@ -109,7 +119,8 @@ class Session(Closing):
         """Join the bus; the session uses the keys of ``station`` by default.
 
         Raises:
-            LinkError: No router within ``link.wait_for_router_s``, or a port is in use.
+            LinkError: No router within ``link.wait_for_router_s``, a port is in use, or a session
+                was opened before a fork.
         """
         raw = open_zenoh(link, "peer" if link.links_directly else "client")
         # Zenoh opens a peer at once and looks for the router in the background.
@@ -117,11 +128,15 @@ class Session(Closing):
             deadline = time.monotonic() + link.wait_for_router_s
             while not raw.info.routers_zid() and not raw.info.peers_zid():
                 if time.monotonic() > deadline:
-                    close_zenoh(raw)
+                    # Not out of the caller's time: where the router hangs, this takes 10 s.
+                    leaving = threading.Thread(target=close_zenoh, args=(raw,), name="leaving")
+                    leaving.start()
+                    leaving.join(_LEAVE_S)
                     raise no_router(link)
                 time.sleep(0.02)
         return cls(raw, station, link)
 
+    @while_open()
     def publisher(
         self,
         topic: Topic[M],
@@ -139,6 +154,7 @@ class Session(Closing):
         key = self._key(topic, sensor, service, instance)
         return self._keep(Publisher(self._raw, topic, key, lossless=lossless))
 
+    @while_open()
     def subscriber(
         self,
         topic: Topic[M],
@@ -191,6 +207,7 @@ class Session(Closing):
             self._alarm = self._keep(Alarm())
         return self._alarm
 
+    @while_open()
     def tap(
         self,
         topics: Sequence[Topic[Any]],
@@ -209,18 +226,22 @@ class Session(Closing):
         """Zenoh's id of this session."""
         return str(self._raw.zid())
 
+    @while_open()
     def foreign_subscriber(self, key: str, *, capacity: int = 4096) -> ForeignSubscriber:
         """Receive raw samples under a key expression that is not palpate's."""
         return self._keep(ForeignSubscriber(self._raw, key, capacity=capacity))
 
+    @while_open()
     def foreign_publisher(self, key: str) -> ForeignPublisher:
         """Publish bytes under a key that is not palpate's."""
         return self._keep(ForeignPublisher(self._raw, key))
 
+    @while_open()
     def foreign_token(self, key: str) -> ForeignToken:
         """Declare a liveliness token that is not palpate's."""
         return self._keep(ForeignToken(self._raw, key))
 
+    @while_open()
     def foreign_tokens(self, key: str, *, timeout_s: float = 1.0) -> list[str]:
         """Keys of the liveliness tokens that match a key expression that is not palpate's."""
         replies = self._raw.liveliness().get(key, timeout=timeout_s)
@@ -251,6 +272,7 @@ class Session(Closing):
             workers=workers,
         )
 
+    @while_open()
     def stream_queryable(
         self,
         endpoint: Endpoint[Q, R],
@@ -350,6 +372,7 @@ class Session(Closing):
         key = self._key(endpoint, check_name(sensor, "sensor"), "", "")
         return is_served(self._asking(), key, LOOK_S)
 
+    @while_open()
     def _ask(
         self,
         key: str,
@@ -376,10 +399,12 @@ class Session(Closing):
             on_timings=on_timings,
         )
 
+    @while_open()
     def caller_token(self, request_id: str) -> CallerToken:
         """Show that this process waits for an answer, until it is closed or this process dies."""
         return CallerToken(self._raw, caller_key(self.station, request_id))
 
+    @while_open()
     def watch_callers(self, on_gone: Callable[[str, float], None]) -> None:
         """Call ``on_gone`` for every caller that waits no longer.
 
@@ -387,10 +412,12 @@ class Session(Closing):
         """
         self._keep(CallerWatch(self._raw, caller_key(self.station, "*"), on_gone))
 
+    @while_open()
     def presence(self, service: str, *, instance: str) -> Presence:
         """Declare this process alive; call ``ready`` on the result when it serves."""
         return self._keep(Presence(self._raw, self.station, service, instance))
 
+    @while_open()
     def claims(
         self,
         *,
@@ -418,6 +445,7 @@ class Session(Closing):
             )
         )
 
+    @while_open()
     def holders(self, root: str, sensor: str) -> list[SensorClaim]:
         """Who holds a claim on a sensor of this station, in order of their instances.
 
@@ -432,6 +460,7 @@ class Session(Closing):
                         found.add(parse_claim_key(str(reply.ok.key_expr)))
         return sorted(found, key=lambda one: one.instance)
 
+    @while_open()
     def alive(self, *, station: str | None = None) -> list[AliveService]:
         """Which processes are alive, and which of them are ready; complete as soon as it is open.
 
@@ -456,10 +485,13 @@ class Session(Closing):
         needed, and closed with this one, which it may be itself.
 
         Raises:
-            LinkError: There is no router.
+            LinkError: There is no router, or this session is closed.
         """
         if not self._link.links_directly or not self._link.connect:
             return self
+        check_process()  # before the lock, which a thread that is not here may hold
+        if self._raw.is_closed():
+            raise LinkError("the session is closed", remedy="open the session again")
         with self._observing_lock:
             if self._observing is None:
                 update = {"direct": False, "wait_for_router_s": _OBSERVER_WAIT_S}
@@ -485,13 +517,16 @@ class Session(Closing):
     def _young(self) -> bool:
         return time.monotonic() - self._opened_s <= _YOUNG_S
 
+    @while_open()
     def has_router(self) -> bool:
         """Whether a router is connected at present."""
         return bool(self._raw.info.routers_zid())
 
     def close(self) -> None:
-        """Leave the bus; takes up to 10 s where the router hangs."""
+        """Leave the bus; takes up to 10 s where the router hangs. In a forked process: nothing."""
         _open.discard(self)
+        if is_inherited():
+            return
         for close in reversed(self._closing):
             with contextlib.suppress(zenoh.ZError):  # already undeclared, or the session is gone
                 close()

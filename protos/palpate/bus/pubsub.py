@@ -26,6 +26,7 @@ from palpate.bus.topics import (
     check_size,
     parse_key,
 )
+from palpate.bus.zenoh_session import check_process, while_open
 from palpate.errors import LinkError, StaleError, StreamTimeout, WireError
 from palpate.messages import StageTimings, Stamp
 from palpate.process import Closing
@@ -103,6 +104,7 @@ class Publisher(Generic[M], Closing):
             WireError: It is larger than a message may be and would be lost (reason ``"size"``).
             LinkError: The session is closed.
         """
+        check_process()
         check_size(payload, self.topic.codec.schema, remedy="publish a smaller message")
         try:
             if self._closed:
@@ -113,8 +115,13 @@ class Publisher(Generic[M], Closing):
                 f"cannot publish on {self.key}: {error}", remedy="open the session again"
             ) from error
 
+    @while_open()
     def matched(self) -> bool:
-        """Whether anyone subscribes at present."""
+        """Whether anyone subscribes at present.
+
+        Raises:
+            LinkError: The session is closed.
+        """
         status: Any = self._publisher.matching_status  # stub says bool, 1.10 gives a status object
         return bool(getattr(status, "matching", status))
 
@@ -353,6 +360,7 @@ class Subscriber(Generic[M], Closing):
         Raises:
             LinkError: The session was closed.
         """
+        check_process()  # also before the locks: one that was held at a fork is never released
         taken: list[ReceivedMessage[M]] = []
         arrival: Arrival | None = None
         with self._reading:
@@ -402,6 +410,7 @@ class Subscriber(Generic[M], Closing):
         """
         if not self._newest_wins:
             raise ValueError("latest() is for subscribers with Delivery.NEWEST")
+        check_process()
         with self._lock:
             self._look()
             wanted = [

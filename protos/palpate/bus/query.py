@@ -20,6 +20,7 @@ import zenoh
 from palpate.bus.attachments import OnTimings, attachment_of, timings_of
 from palpate.bus.endpoints import Endpoint
 from palpate.bus.topics import ENCODING_PREFIX, MAX_MESSAGE_BYTES, check_schema, check_size
+from palpate.bus.zenoh_session import while_open
 from palpate.codec import ERROR
 from palpate.config import check_duration
 from palpate.errors import (
@@ -305,20 +306,25 @@ def no_reply(session: zenoh.Session, key: str, known: bool, *, roles: bool = Fal
 
 
 def is_served(session: zenoh.Session, key: str, wait_s: float) -> bool:
-    """Whether somebody is known to serve the key; if not, that is waited for."""
+    """Whether somebody is known to serve the key; if not, that is waited for.
+
+    Raises:
+        LinkError: The session is closed.
+    """
     if "*" in key:  # Zenoh does not tell
         return False
     end_s = time.monotonic() + wait_s
     cancellation = Cancellation.current()
-    querier = session.declare_querier(key, target=zenoh.QueryTarget.ALL)
-    try:
-        while True:
-            status: Any = querier.matching_status  # stub says bool, 1.10 gives a status object
-            if getattr(status, "matching", status):
-                return True
-            cancelled = cancellation is not None and cancellation.cancelled.is_set()
-            if cancelled or time.monotonic() >= end_s:
-                return False
-            _pause(_POLL_S)
-    finally:
-        querier.undeclare()
+    with while_open():
+        querier = session.declare_querier(key, target=zenoh.QueryTarget.ALL)
+        try:
+            while True:
+                status: Any = querier.matching_status  # stub says bool, 1.10 gives a status object
+                if getattr(status, "matching", status):
+                    return True
+                cancelled = cancellation is not None and cancellation.cancelled.is_set()
+                if cancelled or time.monotonic() >= end_s:
+                    return False
+                _pause(_POLL_S)
+        finally:
+            querier.undeclare()

@@ -16,6 +16,7 @@ from typing import Protocol
 
 import zenoh
 
+from palpate.bus.zenoh_session import is_inherited
 from palpate.errors import LinkError
 from palpate.process import Closing
 
@@ -45,8 +46,10 @@ def undeclare(declared: _Declared) -> None:
 
     A Zenoh object refuses to be undeclared while another thread is in one of its calls. One that
     stays in it (a lossless sender whose receiver hangs) is left to the end of the session. Nothing
-    happens to one that is undeclared already.
+    happens to one that is undeclared already, and in a forked process.
     """
+    if is_inherited():
+        return
     give_up_s = time.monotonic() + _IN_USE_S
     with contextlib.suppress(zenoh.ZError):  # undeclared before, or the session is closed
         while True:

@@ -6,8 +6,6 @@ import threading
 import time
 from dataclasses import dataclass
 
-import zenoh
-
 from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.topics import TARE
 from palpate.errors import PalpateError, StreamTimeout, WireError
@@ -156,9 +154,6 @@ class TareBook:
                         remedy="upgrade that gateway: it breaks the contract",
                         reason="tare",
                     )
-            except zenoh.ZError:  # the session is closed
-                with self._changed:
-                    self._wanted.clear()
             except PalpateError as error:
                 with self._changed:
                     wanted.error = error

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import zenoh
@@ -118,6 +120,56 @@ def _check_certificates(link: LinkConfig) -> None:
         )
 
 
+_opened = False
+_inherited = False
+
+
+def _note_fork() -> None:
+    global _inherited
+    _inherited = _opened
+
+
+os.register_at_fork(after_in_child=_note_fork)
+
+
+def is_inherited() -> bool:
+    """Whether this process was forked from one that had opened a session.
+
+    Zenoh's threads do not exist here: a session, that one or a new one, would wait for ever.
+    """
+    return _inherited
+
+
+def check_process() -> None:
+    """Refuse to use Zenoh in a process where it would wait for ever; see ``is_inherited``.
+
+    Raises:
+        LinkError: A session was opened before a fork.
+    """
+    if _inherited:
+        raise LinkError(
+            "a session was opened before a fork, and none works in the forked process",
+            remedy='start processes with multiprocessing.get_context("spawn"), or open the client '
+            "in the child only",
+        )
+
+
+@contextlib.contextmanager
+def while_open() -> Iterator[None]:
+    """A block, or as a decorator a function, that uses a session which others may close.
+
+    Raises:
+        LinkError: It is closed, or was opened before a fork.
+    """
+    check_process()
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise LinkError(
+            f"the session is closed: {error}", remedy="open the session again"
+        ) from error
+
+
 _IN_USE = re.compile(r"Address already in use|EADDRINUSE|os error 98|os error 48")
 
 
@@ -127,8 +179,12 @@ def open_zenoh(link: LinkConfig, mode: str, *, also_listen: Sequence[str] = ()) 
     ``also_listen`` are endpoints of any protocol of Zenoh that are not offered to others.
 
     Raises:
-        LinkError: A port is in use, or a client finds no router.
+        LinkError: A port is in use, a client finds no router, or another session was opened before
+            a fork.
     """
+    global _opened
+    check_process()
+    _opened = True  # also if it does not open: threads of Zenoh run from now on
     config = zenoh_config(link, mode)
     if also_listen:
         config.insert_json5("listen/endpoints", json.dumps([*link.listen, *also_listen]))
@@ -151,7 +207,12 @@ def open_zenoh(link: LinkConfig, mode: str, *, also_listen: Sequence[str] = ()) 
 
 
 def close_zenoh(session: zenoh.Session) -> None:
-    """Close a Zenoh session; where its router hangs, it is given up, with a warning."""
+    """Close a Zenoh session; where its router hangs, it is given up, with a warning.
+
+    In a forked process nothing happens: the session is its parent's.
+    """
+    if is_inherited():
+        return
     try:
         session.close()
     except zenoh.ZError:

@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar
 
 from palpate.bus import Cancellation
+from palpate.bus.zenoh_session import check_process, is_inherited
 from palpate.client.robot import Client
 from palpate.client.simulations import OnProgress, OnStep
 from palpate.client.streams import Stream, Watch
@@ -62,6 +63,7 @@ class AsyncStream(Generic[M]):
 
     async def __anext__(self) -> M:
         """The next message; see ``Stream.__next__``."""
+        check_process()
         if self._watch is None and not self._closed:
             await self._open()
         while not self._closed:
@@ -249,6 +251,7 @@ class AsyncClient:
 
     async def in_thread(self, work: Callable[[], R]) -> R:
         """The result of ``work``, run in a thread; cancelling cancels the question it asks."""
+        check_process()  # a forked process has none of the pool's threads
         cancellation = Cancellation()
 
         def run() -> R:
@@ -268,7 +271,9 @@ class AsyncClient:
         self._streams.append(stream)
 
     async def aclose(self) -> None:
-        """Leave the bus; streams end."""
+        """Leave the bus; streams end. In a forked process nothing happens."""
+        if is_inherited():
+            return
         for stream in self._streams:
             await stream.aclose()
         client, self._client = self._client, None

@@ -10,6 +10,11 @@ Five lines::
 
 Every failure is a ``PalpateError``; no call hangs, and no old reading is returned as a new one.
 Links, subscriptions and streams come back by themselves when a router or a service does.
+
+A client does not survive a fork, which is how ``multiprocessing`` starts processes on Linux before
+Python 3.14: in a process that was forked after a client was opened, that client and every new one
+raise a ``LinkError``. Start processes with ``multiprocessing.get_context("spawn")``, or open the
+client in the child only.
 """
 
 from __future__ import annotations
@@ -28,6 +33,7 @@ from palpate.bus import AliveService, Delivery, ReceivedMessage, Session, Subscr
 from palpate.bus.attachments import OnTimings
 from palpate.bus.query import LONGEST_S
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, WRENCH, Topic
+from palpate.bus.zenoh_session import check_process, is_inherited
 from palpate.census import ProcessReport, take_census
 from palpate.client.estimates import OnSynthesis, ask_basis, ask_synthesis, ask_tare, ask_zero
 from palpate.client.robot_poses import RobotPosePublisher
@@ -105,7 +111,8 @@ class Client(Closing):
 
     Raises:
         ConfigError: One of these is none.
-        LinkError: No router at ``connect``.
+        LinkError: No router at ``connect``, or a client was opened before this process was forked.
+            Of every method: the client is closed, or was opened before the fork.
     """
 
     def __init__(
@@ -335,6 +342,7 @@ class Client(Closing):
         Raises:
             StreamTimeout: None came in time.
         """
+        check_process()  # before the lock, which a thread that is not here may hold
         check_duration(timeout_s, "timeout_s", most=LONGEST_S)
         key = (FEATURES.name, check_name(sensor, "sensor"))
         with self._lock:
@@ -445,8 +453,13 @@ class Client(Closing):
         return take_census(self.session, timeout_s=self._timeout_s)
 
     def close(self) -> None:
-        """Leave the bus; streams end. Done at the end of a program that has left it open, too."""
+        """Leave the bus; streams end. Done at the end of a program that has left it open, too.
+
+        In a forked process nothing happens: the client is its parent's.
+        """
         _open.discard(self)
+        if is_inherited():
+            return
         for publisher in self._publishers:
             publisher.close()
         with self._lock:
@@ -477,6 +490,7 @@ class Client(Closing):
         return stream
 
     def _latest(self, topic: Topic[M], sensor: str, max_age_s: float) -> M:
+        check_process()
         check_duration(max_age_s, "max_age_s", most=math.inf)
         key = (topic.name, check_name(sensor, "sensor"))
         with self._lock:

@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from palpate.bus import Publisher, Session
 from palpate.bus.delivery import NewestQueue
 from palpate.bus.topics import ROBOT_POSE
+from palpate.bus.zenoh_session import check_process
 from palpate.errors import LinkError, WireError
 from palpate.messages import Pose, RobotPoseFrame
 from palpate.process import Closing
@@ -71,8 +72,9 @@ class RobotPosePublisher(Closing):
 
         Raises:
             WireError: Not three and four finite numbers, or no unit quaternion; nothing is sent.
-            LinkError: The client is closed.
+            LinkError: The client is closed, or was opened before a fork.
         """
+        check_process()
         if self._error is not None or self._closed.is_set():
             raise self._error or LinkError(
                 f"the pose publisher of {self._robot!r} is closed", remedy="make another one"

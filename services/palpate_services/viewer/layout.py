@@ -34,6 +34,9 @@ FIELD_FULL_M = 2e-3
 _FULL_SCALE_COUNTS = 400.0
 """Tared counts at which an electrode is drawn in full colour."""
 
+_LOST_COLOUR = (70, 74, 82)
+"""Of an electrode without a valid reading: darker than one at rest."""
+
 MAX_SENSORS = 8
 """Tabs in one view; more sensors are recorded but not laid out."""
 
@@ -274,9 +277,12 @@ def electrode_colours(count: int) -> list[tuple[int, int, int]]:
 
 
 def electrode_shades(tared: npt.NDArray[np.float32]) -> npt.NDArray[np.uint32]:
-    """Packed RGBA of tared counts: blue where negative, orange where positive; the same shape."""
+    """Packed RGBA of tared counts: blue where negative, orange where positive; the same shape.
+
+    Dark grey where there are none (NaN).
+    """
     strength = np.sqrt(np.clip(np.abs(tared) / _FULL_SCALE_COUNTS, 0, 1))[..., None]
     rest = np.array([150.0, 156.0, 166.0])
     full = np.where((tared < 0)[..., None], (60.0, 170.0, 255.0), (255.0, 120.0, 50.0))
-    rgb = (rest + strength * (full - rest)).astype(np.uint32)
-    return packed_rgba(rgb)
+    rgb = np.where(np.isnan(strength), _LOST_COLOUR, rest + strength * (full - rest))
+    return packed_rgba(rgb.astype(np.uint32))

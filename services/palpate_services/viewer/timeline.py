@@ -216,7 +216,8 @@ class SensorTimeline:
     def take(self) -> defaultdict[str, list[Any]]:
         """The rows since the last call, by what they show.
 
-        ``electrodes/raw`` or ``electrodes/tared``: counts, values of shape ``(19,)`` (SP: 24).
+        ``electrodes/raw`` or ``electrodes/tared``: counts, float32, shape ``(19,)`` (SP: 24); NaN
+        where not valid.
         ``pressure``: PDC followed by the PAC samples [counts], float32, shape ``(23,)`` (SP: 28);
         NaN where not valid. Of ``truth`` and ``estimate`` each: ``force/...`` [N], shape ``(3,)``;
         ``arrow/...``, the same at instants when it is known where it acts, or that nothing touches;
@@ -236,12 +237,13 @@ class SensorTimeline:
         else:
             kind, counts = "tared", frame.electrodes - tare.electrodes
             self.has_tared = True
-        self._rows[f"electrodes/{kind}"].append(_row(frame.stamp, counts))
         pressure = np.concatenate([[frame.pdc], frame.pac]).astype(np.float32)
         layout = frame.sensor_type.layout
         if frame.validity != layout.all_valid:
-            bits = (layout.pdc_bit, *range(layout.first_pac_bit, layout.slots))
-            pressure[[not frame.validity >> bit & 1 for bit in bits]] = np.nan
+            valid = np.array([frame.validity >> bit & 1 for bit in range(layout.slots)], bool)
+            counts[~valid[: layout.electrodes]] = np.nan
+            pressure[~valid[[layout.pdc_bit, *range(layout.first_pac_bit, layout.slots)]]] = np.nan
+        self._rows[f"electrodes/{kind}"].append(_row(frame.stamp, counts))
         row = _row(frame.stamp, pressure, slot_period_ns=frame.slot_period_ns)
         self._rows["pressure"].append(row)
 
