@@ -166,7 +166,7 @@ def while_open() -> Iterator[None]:
         yield
     except zenoh.ZError as error:
         raise LinkError(
-            f"cannot use the session: {error}", remedy="open the session again"
+            f"the session is closed, or Zenoh refuses: {error}", remedy="open the session again"
         ) from error
 
 
