@@ -31,7 +31,6 @@ from palpate_training.datasets.export import features
 from palpate_training.datasets.features import NOMINAL_PERIOD_S, FeatureDataset
 from palpate_training.datasets.ingest import ingest_lasa
 from palpate_training.evaluation.transfer import (
-    GUARD_S,
     PRESS_S,
     Finger,
     fingers_of,
@@ -47,6 +46,7 @@ from palpate_training.learning.other_fingers import (
     OtherFingers,
     SharedForce,
 )
+from palpate_training.learning.splits import GUARD_S
 from palpate_training.tasks.finger import (
     ESTIMATORS,
     LIKE_OTHERS,

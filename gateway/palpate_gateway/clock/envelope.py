@@ -44,14 +44,14 @@ _WILD_PPM = 50_000.0
 
 
 _STOPPED_NS = 5e8
-"""Readings that are later by more from one to the next on, and stay so, have not waited: the clock
-has stopped and gone on, as that of a simulation does [ns]."""
+"""A delay that jumps by more than this and stays there is no wait of readings: the clock of the
+device has stopped and gone on, as that of a simulation does [ns]."""
 
 _STOPPED_S = 2.0
-"""They stay so for this long, by both clocks [s]: what a stall held back comes all at once."""
+"""How long it must stay there, by both clocks [s]: what a stall held back comes all at once."""
 
 _STOPPED_READINGS = 5
-"""And there are so many, however rare they are."""
+"""How many readings must have come since, however rare they are."""
 
 
 class ClockEnvelope:

@@ -23,6 +23,7 @@ from palpate_training.datasets.container import add_array, refuse_repeated
 from palpate_training.datasets.features import FeatureDataset, period_of
 from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.metrics import force_errors
+from palpate_training.learning.splits import GUARD_S
 from palpate_training.learning.twin_line import TwinLine
 from palpate_training.systems.transfer import (
     ALIKE,
@@ -37,7 +38,6 @@ Floats = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.integer]
 
 PRESS_S = 2.0
-GUARD_S = 1.0
 GAP_S = 1.0
 """A longer gap between rows ends an uninterrupted piece."""
 

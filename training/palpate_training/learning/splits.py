@@ -24,6 +24,9 @@ Rows = npt.NDArray[np.int64]
 Labels = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
 
+GUARD_S = 1.0
+"""Rows of a recording that are within this time of another side's are left out [s]."""
+
 
 @dataclass(frozen=True, slots=True)
 class RowSplit:

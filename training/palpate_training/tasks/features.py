@@ -54,7 +54,7 @@ from palpate_training.learning.metrics import (
 )
 from palpate_training.learning.networks import predict, round_to_half, training_device
 from palpate_training.learning.ranges import ends_of, known_inputs, places_of
-from palpate_training.learning.splits import Rows, RowSplit, by_group
+from palpate_training.learning.splits import GUARD_S, Rows, RowSplit, by_group
 
 _log = logging.getLogger(__name__)
 
@@ -69,10 +69,6 @@ FALSE_CONTACT_SHARE = 0.001
 
 MIN_CONTACT_THRESHOLD_N = 0.05
 """No lower threshold than this, however quiet the training data [N]."""
-
-GUARD_S = 1.0
-"""Where presses are blocks of one recording, rows so near to those of another side are on none [s]:
-they are nearly copies."""
 
 _GOLDEN_ROWS = 64
 

@@ -19,7 +19,7 @@ from palpate.files.tasks import tensors_of
 from palpate.files.training_range import KnownInputs
 from palpate.process import require
 from palpate_training.datasets.experiment import MixedDataset, read_mixed
-from palpate_training.datasets.features import open_dataset
+from palpate_training.datasets.features import open_dataset, press_of
 from palpate_training.learning.export import PARITY_MAX, basis_of, refuse_existing, run_onnx
 from palpate_training.learning.ranges import known_inputs
 from palpate_training.learning.splits import Rows
@@ -54,7 +54,7 @@ def upgrade_bundle(old: Path, data: Path, out: Path, *, units: Sequence[str] = (
             )
         presses = open_dataset(data)
         found = features_range(presses, np.arange(len(presses)))
-        known = known_inputs(presses.tared_counts, presses.group)
+        known = known_inputs(presses.tared_counts, press_of(presses))
     else:
         mixed = read_mixed(data)
         rows = _rows_of(mixed, units)
