@@ -105,7 +105,8 @@ def _availability(found: dict[str, Any]) -> str:
     return (
         "The robot had a fresh estimate (30 ms old at most; the finger and its line take 12 of "
         f"them) for {100 * share['all']:.1f} % of the time, and for "
-        f"{100 * share['between_faults']:.1f} % of the {share['between_faults_s']:.0f} s outside of faults. A controller that asked "
+        f"{100 * share['between_faults']:.1f} % of the {share['between_faults_s']:.0f} s outside "
+        "of faults. A controller that asked "
         f"{asked['asked']:,} times got one {asked['fresh']:,} times, and an error "
         f"{asked['too_old']:,} times. The machine was not idle: "
         f"{found['machine']['cpus']} cores, load {load['median']:.1f} in the median, "
