@@ -1,0 +1,28 @@
+"""Figures of the result pages are of what the pages say they are of."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def program(name: str) -> dict[str, Any]:
+    """Names of a program that makes a page."""
+    return runpy.run_path(str(ROOT / "docs" / name))
+
+
+def test_every_column_of_the_population_is_a_mean_over_the_seeds() -> None:
+    page = program("make_population.py")
+
+    def report(error: float) -> dict[str, Any]:
+        errors = dict.fromkeys(page["FIGURES"], error)
+        rivals = ("network", "ridge", "constant", "network, all +0.05", "network, all -0.05")
+        return {"cells": {cell: dict.fromkeys(rivals, errors) for cell in page["CELLS"]}}
+
+    table = page["cells_table"]([report(1.0), report(3.0)])
+    for row in table.splitlines()[2:]:
+        _, *cells = (cell.strip() for cell in row.strip("|").split("|"))
+        assert [cell.split()[0] for cell in cells] == ["2"] * len(cells)
