@@ -14,6 +14,13 @@ def program(name: str) -> dict[str, Any]:
     return runpy.run_path(str(ROOT / "docs" / name))
 
 
+def test_a_bound_is_not_rounded_down() -> None:
+    at_most = program("make_numbers.py")["_at_most"]
+    assert at_most(6.5485) == "6.6"
+    assert at_most(0.1501, 2) == "0.16"
+    assert at_most(0.150000676, 2) == "0.15"
+
+
 def test_every_column_of_the_population_is_a_mean_over_the_seeds() -> None:
     page = program("make_population.py")
 
