@@ -2,12 +2,14 @@
 
 ``python docs/make_intervals.py runs ../shared/data``   all; with the recordings of two real BioTacs
 ``python docs/make_intervals.py runs``                  without: virtual fingers and the twin only
+``python docs/make_intervals.py``                       the page alone, from the JSON files
 ``python docs/make_intervals.py --virtual OUT.h5``      what features-virtual is calibrated with
 
 ``runs`` holds experiments that no training has seen; the page says the commands. ``calibrate``,
 ``check`` and ``scattered-1`` and ``-2`` are what the shipped bundles were calibrated with, ``test``
 and ``random-500`` are other presses on the same specimens, ``drawn`` those of ``test`` on specimens
-that were never met. A press is what counts: its rows are nearly copies. Minutes on two cores.
+that were never met. A press is what counts: its rows are nearly copies. Minutes on two cores. What
+the page says of the method for fingers never met is from docs/results/transfer.json.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from palpate_training.datasets.experiment import MixedDataset, read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import OF_CONTACT, FeatureDataset, write_dataset
 from palpate_training.datasets.ingest import ingest_lasa, ingest_record
-from palpate_training.evaluation.transfer import PRESS_S, fingers_of, run_transfer
+from palpate_training.evaluation.transfer import PRESS_S
 from palpate_training.figures.style import markdown_table, new_figure, save
 from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.intervals import bounds, fit_formulas, terms_of
@@ -72,7 +74,8 @@ VIRTUAL_SEED = 3  # features-virtual is calibrated with this seed; it was traine
 EVERY = 10
 HZ = 100
 OWN_S = (30, 60, 120)
-SHOTS = (0, 5, 20)
+WAYS = {"tare only": 0, "5 presses": 5, "20 presses": 20}
+"""Rows of transfer.json that are told, and how many presses are labelled."""
 SCALES, SHRINKS = (30.0, 40.0, 60.0, 80.0, 120.0), (0.003, 0.001, 0.0003, 0.0001)
 """Compressions and shrinkages of the pattern that were compared."""
 
@@ -84,13 +87,21 @@ def main(runs: Path, data: Path | None) -> None:
     if data is not None:
         fingers = real_fingers(data)
         facts["cells"] += real_cells(fingers)
-        facts["transfer"] = transfer_cells(fingers)
         facts["cells"] += [own_cell(finger, seconds) for seconds in OWN_S for finger in fingers]
         facts["real_flags"] = real_flags(fingers)
         facts["pattern"] = pattern_choice(runs, fingers)
     OUT.with_suffix(".json").write_text(json.dumps(facts, indent=1) + "\n")
     draw(facts["cells"])
-    OUT.with_suffix(".md").write_text(page(facts))
+    write_page()
+
+
+def write_page() -> None:
+    """The page, from what is in the JSON files."""
+    facts, transfer = (
+        json.loads(path.read_text(encoding="utf-8"))
+        for path in (OUT.with_suffix(".json"), OUT.with_name("transfer.json"))
+    )
+    OUT.with_suffix(".md").write_text(page(facts, transfer["ways"]), encoding="utf-8")
 
 
 def shipped(name: str) -> tuple[Bundle, Runtime]:
@@ -283,17 +294,6 @@ def real_cells(fingers: Sequence[FeatureDataset]) -> list[dict[str, Any]]:
     return found
 
 
-def transfer_cells(fingers: Sequence[FeatureDataset]) -> list[dict[str, Any]]:
-    """The method for fingers never met, each from the other: its own intervals of the magnitude."""
-    both = [fingers_of(finger)[0] for finger in fingers]
-    return [
-        {key: result[key] for key in ("test", "shots", "draws", "coverage_90", "interval_median_n")}
-        for shots in SHOTS
-        for k in range(2)
-        for result in [run_transfer([both[1 - k]], both[k], shots=shots, draws=4)]
-    ]
-
-
 def own_cell(data: FeatureDataset, seconds: int) -> dict[str, Any]:
     """A finger's own first seconds, as `palpate calibrate` learns; bounds of what comes later."""
     force, tared = data.force.astype(np.float64), data.tared_counts.astype(np.float64)
@@ -483,8 +483,8 @@ BOUND_HEAD = [
 BIN_HEAD = ["bundle", "presses of", "bound of", "below 1 N", "1 to 2", "2 to 4", "4 to 8", "above"]
 
 
-def page(facts: dict[str, Any]) -> str:
-    """The Markdown page."""
+def page(facts: dict[str, Any], ways: list[dict[str, Any]]) -> str:
+    """The Markdown page; ``ways`` are those of transfer.json."""
     cells = facts["cells"]
     real = [one for one in cells if "lasa" in one["what"]]
     simulated = [one for one in cells if one not in real]
@@ -512,9 +512,11 @@ def page(facts: dict[str, Any]) -> str:
             markdown_table(
                 ["finger", "labelled presses", "holds", "half width"],
                 [
-                    [one["test"], f"{one['shots']}", percent(one["coverage_90"]),
+                    [one["test"], f"{WAYS[way['name']]}", percent(one["coverage_90"]),
                      f"{one['interval_median_n']:.2f} N"]
-                    for one in facts["transfer"]
+                    for way in ways
+                    if way["name"] in WAYS
+                    for one in way["results"]
                 ],
             ),
         ]  # fmt: skip
@@ -632,5 +634,7 @@ def _bin_at(low: float) -> int:
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--virtual"]:
         write_dataset(Path(sys.argv[2]), virtual_presses(VIRTUAL_SEED, 1))
-    else:
+    elif sys.argv[1:]:
         main(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else None)
+    else:
+        write_page()
