@@ -6,6 +6,9 @@ import runpy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -19,6 +22,14 @@ def test_a_bound_is_not_rounded_down() -> None:
     assert at_most(6.5485) == "6.6"
     assert at_most(0.1501, 2) == "0.16"
     assert at_most(0.150000676, 2) == "0.15"
+
+
+def test_a_bound_may_hold_in_most_rows_and_in_few_whole_presses() -> None:
+    errors = np.ones(40)
+    errors[::10] = 3.0  # one row of ten in each of four presses
+    found = program("make_intervals.py")["share_of"](errors, np.full(40, 2.0), np.arange(40) // 10)
+    assert found["coverage"] == pytest.approx(0.9)
+    assert found["whole"] == 0.0
 
 
 def test_every_column_of_the_population_is_a_mean_over_the_seeds() -> None:
