@@ -467,6 +467,15 @@ def bound_rows(cells: Iterable[dict[str, Any]]) -> list[list[str]]:
     ]  # fmt: skip
 
 
+def bound_table(cells: Iterable[dict[str, Any]]) -> str:
+    """The table of bounds, without whole presses where none were counted."""
+    rows = bound_rows(cells)
+    at = BOUND_HEAD.index("whole presses")
+    kept = [k for k in range(len(BOUND_HEAD)) if k != at or any(row[at] for row in rows)]
+    head, *rows = ([row[k] for k in kept] for row in (BOUND_HEAD, *rows))
+    return markdown_table(head, rows)
+
+
 def bin_rows(cells: Iterable[dict[str, Any]]) -> list[list[str]]:
     """Rows of the table by force."""
     rows = []
@@ -501,7 +510,7 @@ def page(facts: dict[str, Any], ways: list[dict[str, Any]]) -> str:
     ]  # fmt: skip
     parts = [
         HEAD,
-        markdown_table(BOUND_HEAD, bound_rows(simulated)),
+        bound_table(simulated),
         BOUND_NOTE,
         "## By true force\n\nEach cell: how often the bound holds (number of presses), and the"
         " median bound.\n",
@@ -511,7 +520,7 @@ def page(facts: dict[str, Any], ways: list[dict[str, Any]]) -> str:
     ]
     if real:
         parts += [
-            markdown_table(BOUND_HEAD, bound_rows(real)),
+            bound_table(real),
             "\nThe method for fingers that training has not met ([transfer](transfer.md)) has its"
             " own intervals of the magnitude:\n",
             markdown_table(
