@@ -192,6 +192,28 @@ def _real_force() -> Iterator[Claim]:
     )
 
 
+def _elsewhere() -> Iterator[Claim]:
+    """How much worse a force is on a real finger that training has not met."""
+    rows = _rows("force-real.json")
+    found = _read("transfer.json")
+    (unseen,) = (way["results"] for way in found["ways"] if way["name"] == "tare only")
+    figures = {}
+    for number, (other, met) in enumerate(zip(unseen, found["later"], strict=True), 1):
+        net, own = (
+            rows[f"lasa-finger{number}, {held}", "MLP"]["force_magnitude_median_n"]
+            for held in ("unseen", "20 blocks")
+        )
+        figures[f"net{number}"] = f"{net / own:.1f}"
+        ratio = other["magnitude_median_n"] / met["magnitude_median_n"]
+        figures[f"transfer{number}"] = f"{ratio:.1f}"
+    yield Claim("docs/comparison.md", "errs {net1} and {net2} times as much on another", figures)
+    yield Claim(
+        "docs/comparison.md",
+        "`palpate train transfer` errs {transfer1} and {transfer2} times as much as on",
+        figures,
+    )
+
+
 def _calibrated() -> Iterator[Claim]:
     """What a simulated finger learns from ten presses."""
     cells = _read("calibrate.json")["simulated"]["calibrate"]
@@ -428,6 +450,7 @@ def claims() -> list[Claim]:
         *_fem(),
         *_real_force(),
         *_twin(),
+        *_elsewhere(),
         *_calibrated(),
         *_chaos(),
         *_attacks(),
