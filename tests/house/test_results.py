@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,14 @@ ROOT = Path(__file__).resolve().parents[2]
 def program(name: str) -> dict[str, Any]:
     """Names of a program that makes a page."""
     return runpy.run_path(str(ROOT / "docs" / name))
+
+
+@pytest.mark.parametrize("name", ["attacks", "faults", "hostile", "web"])
+def test_programs_that_use_the_tests_run_as_files(name: str, tmp_path: Path) -> None:
+    path = ROOT / "docs" / f"make_{name}.py"
+    command = [sys.executable, "-c", f"import runpy; runpy.run_path({str(path)!r})"]
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
 
 
 def test_a_bound_is_not_rounded_down() -> None:
