@@ -14,6 +14,7 @@ from palpate.errors import ConfigError
 from palpate.messages import COUNTS_MAX
 from palpate_deploy.bench.e2e import Run
 from palpate_deploy.bench.e2e import _median as e2e_median
+from palpate_deploy.bench.fleet import _latency as fleet_latency
 from palpate_deploy.bench.harness import SourceGate, bench_counts, read_rows, write_rows
 from palpate_deploy.bench.results import Latency, append_history, latency, rounds
 
@@ -60,6 +61,14 @@ def test_the_largest_latency_and_all_losses_of_several_runs_are_told() -> None:
     assert told["p50_s"] == pytest.approx(0.1)
     assert told["max_s"] == pytest.approx(0.9)
     assert told["lost"] == 1
+
+
+def test_the_latency_of_a_phase_leaves_out_what_came_before(tmp_path: Path) -> None:
+    rows = [(number, 1000 * number, 1000 * number + 100 * (number % 3)) for number in range(6)]
+    write_rows(tmp_path / "out.npz", ["a"] * 6, rows, dropped=0)
+    assert fleet_latency(tmp_path / "out.npz", 1)["received"] == 6
+    found = fleet_latency(tmp_path / "out.npz", 1, since_ns=3000)
+    assert (found["received"], found["lost"]) == (3, 0)
 
 
 def test_rounds_are_cut_at_pauses_and_warmed_up() -> None:

@@ -27,6 +27,19 @@ def test_programs_that_use_the_tests_run_as_files(name: str, tmp_path: Path) -> 
     assert run.returncode == 0, run.stderr
 
 
+def test_the_plan_of_a_fleet_ends_at_twice_what_was_measured() -> None:
+    page = program("make_fleet.py")
+
+    def fleet(stations: int, cpu: float) -> dict[str, Any]:
+        phase = {"bytes_hz_each": 1e3, "site_cpu_ratio": cpu, "site_rss_bytes": 0, "p50_s": 0.02}
+        return {"stations": stations, "phases": dict.fromkeys(page["PHASES"], phase)}
+
+    table = page["plan_table"]({"scale": [fleet(1, 0.005), fleet(16, 0.012)]})
+    assert table.count("| more than 32 |") == len(page["PHASES"])
+    table = page["plan_table"]({"scale": [fleet(1, 0.0), fleet(16, 0.3)]})
+    assert table.count("| 25 |") == len(page["PHASES"])
+
+
 def test_a_bound_is_not_rounded_down() -> None:
     at_most = program("make_numbers.py")["_at_most"]
     assert at_most(6.5485) == "6.6"
