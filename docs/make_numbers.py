@@ -15,6 +15,7 @@ import re
 import runpy
 import statistics
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,6 +79,13 @@ def _fem() -> Iterator[Claim]:
     }
     yield Claim("README.md", "{deep} of {all} reach the paper's depths", figures)
     yield Claim("README.md", "or 32 N; {good} go 0.6 mm deeper or reach 32 N", figures)
+    outcomes = Counter(run["outcome"] for run in runs)
+    found = {
+        "complete": str(outcomes["complete"]),
+        "limit": str(outcomes["force limit"]),
+        "early": str(len(runs) - len(good)),
+    }
+    yield Claim("docs/results/twin.md", "later has {complete}, {limit} and {early}.", found)
     yield Claim("README.md", "finite elements: {unknowns} unknowns", figures)
     yield Claim("README.md", "| {seconds} s (goal 8; the paper's model", figures)
     yield Claim("README.md", "on six processors), {mib} MiB", figures)
