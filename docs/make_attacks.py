@@ -1,6 +1,6 @@
 """Write docs/results/attacks.md and .json: attacks on a station with certificates, and their end.
 
-``python -m docs.make_attacks`` starts a station, attacks it as ``tests/hostile/attacks.py`` says,
+``python docs/make_attacks.py`` starts a station, attacks it as ``tests/hostile/attacks.py`` says,
 and measures what certificates and roles cost a message. It takes two minutes on an idle machine.
 """
 
@@ -16,6 +16,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # where tests/ is
+
 from tests.hostile.attack_bus import Outcome
 from tests.hostile.attacks import ATTACKS
 from tests.hostile.lab import LIVE_S, Lab
@@ -31,7 +34,7 @@ PAGE = Path(__file__).parent / "results" / "attacks.md"
 HEAD = """# Attacks on a station with certificates
 
 Which attacks on a station with certificates are refused, and what the logs show.
-Made by `python -m docs.make_attacks`; the attacks are `tests/hostile/attacks.py`, whose tests
+Made by `python docs/make_attacks.py`; the attacks are `tests/hostile/attacks.py`, whose tests
 assert what this page shows. The station runs `palpate up` with router, gateway and features, one
 virtual finger and one robot's poses, on one host; the attackers are Zenoh sessions, TLS clients and
 files. [security.md](../security.md) says what each stands for.

@@ -1,6 +1,6 @@
 """Write docs/results/faults.md: every fault of every emulated device, through worker and pipeline.
 
-``python -m docs.make_faults`` takes about ten minutes on an idle machine. A trial in which this
+``python docs/make_faults.py`` takes about ten minutes on an idle machine. A trial in which this
 process was suspended is repeated: it would measure the machine, not the gateway.
 """
 
@@ -10,6 +10,8 @@ import sys
 import threading
 import time
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # where tests/ is
 
 from tests.gateway.device_cases import CASES, Case
 from tests.gateway.fault_bench import FaultBench, Outcome
@@ -30,7 +32,7 @@ _TRIES = 20
 HEAD = """# Faults: how they show, and how soon they are over
 
 How each fault of each emulated device is reported, and how soon the device works again afterwards.
-Made by `python -m docs.make_faults`: the gateway's own worker and pipeline read each device in
+Made by `python docs/make_faults.py`: the gateway's own worker and pipeline read each device in
 software. Each device has each of its faults for {lasts} s, and outages also for {long} s. Every
 message is compared with the load or the counts of the device at that time.
 

@@ -216,7 +216,7 @@ def served(report: dict[str, Any]) -> str:
 def swept(runs: list[dict[str, Any]]) -> str:
     """Sweeps, from the command to the disk."""
     head = ["command", "machine", "presses", "ms a trajectory", "first [s]", "99 % [s]",
-            "last [s]", "outcomes", "code of"]  # fmt: skip
+            "last [s]", "whole [s]", "outcomes", "code of"]  # fmt: skip
     return markdown_table(
         head,
         [
@@ -224,7 +224,7 @@ def swept(runs: list[dict[str, Any]]) -> str:
                 f"`{run['command']}`", f"{run['machine']}, {run['cores']} cores",
                 f"{run['results']:,}", f"**{run['ms_a_trajectory']:.0f}**",
                 f"{run['first_s']:.0f}", f"{run['most_s']:.0f}", f"{run['last_s']:.0f}",
-                outcomes(run), run["commit"],
+                f"{run['whole_s']:.0f}", outcomes(run), run["commit"],
             ]
             for run in runs
         ],

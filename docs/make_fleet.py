@@ -22,6 +22,8 @@ PAGE = DOCS / "fleet.md"
 BEGIN, END = "<!-- written by docs/make_fleet.py -->", "<!-- end -->"
 SHARE = 0.5
 """Share of one core that the site's router may take in the plan."""
+BEYOND = 2
+"""Times the largest fleet that was measured: the plan says nothing of larger ones."""
 
 PHASES = {
     "nobody": "nobody",
@@ -47,6 +49,7 @@ def _per_station(scale: list[dict[str, Any]], phase: str, value: str) -> float:
 def results_page(values: Mapping[str, Any]) -> str:
     """The whole page of results."""
     scale, machine = values["scale"], values["machine"]
+    beside = all("floor_beside" in one for one in scale)
     rows = [
         [
             str(one["stations"]),
@@ -125,8 +128,12 @@ cable, both ways, with all framing. Latency is from the stamp to the consumer, t
             rows,
         )
     }
-The floor is the latency of the same process, at the same time, to a consumer that is linked to it
-directly, over one cable and without a router.
+The floor is the latency of the same process to a consumer that is linked to it directly, over one
+cable and without a router, {
+        "while the raw frames are listened to"
+        if beside
+        else "from the start of the stations to the end of all three phases"
+    }.
 
 {_table("stations | floor p50, p99 ms | raw frames: times the floor's p50 | p99", floors)}
 ## A whole station
@@ -156,17 +163,26 @@ one has taken the same request.
 def plan_table(values: Mapping[str, Any]) -> str:
     """How many stations one site's router carries."""
     scale = values["scale"]
+    largest = BEYOND * scale[-1]["stations"]
     rows = []
     for phase, words in PHASES.items():
         cpu = _per_station(scale, phase, "site_cpu_ratio")
         memory = _per_station(scale, phase, "site_rss_bytes")
         rate = median(one["phases"][phase]["bytes_hz_each"] for one in scale)
-        most = f"{SHARE / cpu:.0f}" if cpu > 1e-4 else "more than measured"
+        most = str(int(SHARE / cpu)) if cpu * largest > SHARE else f"more than {largest}"
         rows.append([words, f"{rate / 1e3:.1f}", f"{100 * cpu:.2f}", f"{memory / 1e6:.2f}", most])
-    return _table(
+    table = _table(
         "one consumer listens to | kB/s a station | site router, % of a core a station"
         f" | MB a station | stations at {100 * SHARE:.0f} % of a core",
         rows,
+    )
+    last = scale[-1]
+    waits = (last["phases"][phase] for phase in ("features", "electrodes"))
+    told = " and ".join(f"{1e3 * one['p50_s']:.0f} ms" for one in waits)
+    return (
+        f"{table}\nAt most {last['stations']} stations were measured; nothing is said of more than"
+        f" {largest}. With {last['stations']} and all else on those cores a message took {told} in"
+        " the median (estimates, raw frames): processor time says nothing of latency."
     )
 
 

@@ -1,6 +1,6 @@
 """Write docs/results/hostile-files.md and .json: bad bundles and records, and what they cost.
 
-``python -m docs.make_hostile`` makes each file, gives it to the ``palpate`` command in a process of
+``python docs/make_hostile.py`` makes each file, gives it to the ``palpate`` command in a process of
 its own, and removes it. It takes three minutes on an idle machine, and needs 2 GB of the disk.
 """
 
@@ -15,6 +15,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # where tests/ is
+
 from tests.hostile import bundles, records, trial
 
 from palpate.errors import printable
@@ -28,7 +30,7 @@ BYTES_MAX = 500_000_000
 HEAD = """# Bad bundles and records: refused soon, by name, with little memory
 
 What bad bundles and records do to the commands that read them. Made by
-`python -m docs.make_hostile`: each file is given to `palpate model verify`, or to
+`python docs/make_hostile.py`: each file is given to `palpate model verify`, or to
 `palpate info`, in a process of its own. *Time* counts from the start of Python; *memory* is the
 largest resident memory of the command, or of the child process in which it tries a model. The goal
 is a typed error within {seconds:.0f} s and {megabytes:.0f} MB; the first row of each table is a

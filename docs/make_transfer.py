@@ -179,8 +179,10 @@ stay below [N] / median error of the angle [rad].
   force.
 * *Presses*: it may also use this number of pieces of 2 s with known forces, drawn at random
   {facts["draws"]} times. Rows within 1 s of them are not tested.
-* *Constant*: the mean force of the other finger; with presses, that of the labelled rows.
-* *Ridge*: a ridge regression on tared counts, which learns from the same rows.
+* *Constant*: the mean force of the first 80 % of the other finger's recording; with presses, that
+  of the labelled rows.
+* *Ridge*: a ridge regression on tared counts, which learns from the same rows, and with presses
+  from both; the last 20 % of the other's recording choose its penalty.
 
 With a tare only, on electrodes that were changed: the change is of the logarithm of the impedance
 over that at rest, of all electrodes alike or of each.

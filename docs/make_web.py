@@ -1,6 +1,6 @@
 """Draw ``docs/pictures/web.png``: the page of a virtual station while its finger is touched.
 
-``python -m docs.make_web``; needs Chromium, and takes about a minute.
+``python docs/make_web.py``; needs Chromium, and takes about a minute.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # where tests/ is
 
 from tests.deploy.browser import Browser, chromium
 from tests.deploy.web_station import coloured, web_station

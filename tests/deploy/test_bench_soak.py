@@ -9,12 +9,17 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar, cast
 
 import numpy as np
 import pytest
 
+from palpate.bus import Session
+from palpate.errors import StreamTimeout
 from palpate_deploy.bench.growth import (
     BINS,
+    Growth,
     History,
     Use,
     Verdict,
@@ -23,6 +28,7 @@ from palpate_deploy.bench.growth import (
     use_of,
     verdict_of,
 )
+from palpate_deploy.bench.soak import SoakResult, _Client
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -106,6 +112,48 @@ def test_a_slope_that_is_not_known_is_no_verdict() -> None:
     assert verdict_of(0.9, 0.2) is Verdict.UNDECIDED
     assert verdict_of(50.0, 60.0) is Verdict.UNDECIDED
     assert verdict_of(3.0, 1.5) is Verdict.GROWS
+
+
+def soaked(slope_mb_per_h: float, half: float) -> SoakResult:
+    """A run of one process with such a slope, in which nothing was lost."""
+    verdict = verdict_of(slope_mb_per_h, half)
+    growth = Growth(100.0, slope_mb_per_h, half, (3, 3), (10, 10), 0, verdict)
+    return SoakResult(40.0, 10.0, 1, {"gateway": growth}, {}, {}, 1.0, 2.0, 1.0, 0)
+
+
+def test_a_run_that_is_too_short_to_tell_does_not_meet_the_goal() -> None:
+    assert soaked(0.2, 0.1).met
+    short = soaked(0.2, 1.3)
+    assert short.fine
+    assert not short.met
+
+
+def test_frames_without_features_are_lost() -> None:
+    class Stream:
+        counters: ClassVar[dict[str, int]] = {}
+
+        def __init__(self, sequences: list[int]) -> None:
+            self._left = sequences
+
+        def next(self, timeout_s: float) -> SimpleNamespace:
+            if not self._left:
+                raise StreamTimeout("no more", remedy="none")
+            source = SimpleNamespace(sequence=self._left.pop(0))
+            return SimpleNamespace(sensor="finger", message=SimpleNamespace(source=source))
+
+    streams = {name: Stream([5, 6, 9, 10]) for name in ("electrodes", "features", "field")}
+    client = _Client(
+        cast(
+            Session,
+            SimpleNamespace(subscriber=lambda topic, **_: streams.get(topic.name, Stream([]))),
+        )
+    )
+    while sum(client.received.values()) < 12:
+        time.sleep(0.01)
+    client.close()
+    assert {name: count for name, count in client.lost().items() if count} == {
+        "client frames without features": 2
+    }
 
 
 def test_too_few_samples_are_no_answer() -> None:

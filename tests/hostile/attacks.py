@@ -1,7 +1,7 @@
 """Attacks on a station with certificates, each by what a stranger or a wrong role can really send.
 
 Each returns what came of it. ``tests/hostile/test_attacks.py`` asserts it, and
-``python -m docs.make_attacks`` writes it down.
+``python docs/make_attacks.py`` writes it down.
 """
 
 from __future__ import annotations

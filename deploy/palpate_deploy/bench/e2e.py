@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from palpate.errors import LinkError
 from palpate_deploy.bench.harness import SourceGate, read_rows
 from palpate_deploy.bench.load import LoadResult, ramp_rate, run_load, start_palpate
 from palpate_deploy.bench.results import Latency, finish, latency, progress_bar, stage_medians
-from palpate_deploy.bench.station import SETTLE_S
+from palpate_deploy.bench.station import SETTLE_S, wait_ready
 from palpate_deploy.station.host import free_endpoint
 from palpate_deploy.station.processes import FiniteRun
 from palpate_services.inference.repository import Repository
@@ -129,15 +130,20 @@ def measure_latency(*, seconds: float, rounds: int, bundle: str, model: Path, ba
         outs = [children.folder / "palpate.npz", children.folder / "floor.npz"]
         options = {"rate_hz": RATE_HZ, "gate": str(gates), "gate_index": _PALPATE}
         finger = {"name": "finger", "driver": "bench", "options": options}
-        start_palpate(children, bundle, outs[_PALPATE], [finger], delivery="newest", core=core)
+        profile = start_palpate(
+            children, bundle, outs[_PALPATE], [finger], delivery="newest", core=core
+        )
         _start_floor(children, model, outs[_FLOOR], gates, "" if core == "any" else str(core))
         names = ["gateway", "features", "client", "floor-source", "floor-service", "floor-client"]
         # The first frames are not measured: tare, first inference, page faults.
-        for gate in opened:
+        for side, gate in enumerate(opened):
             gate.set(True)
+            if side == _PALPATE:
+                wait_ready(profile, {"gateway"})  # with its first frames
             time.sleep(1.5)
             gate.set(False)
             time.sleep(SETTLE_S)
+        begun_ns = time.monotonic_ns()
         task = bar.add_task("latency, interleaved", total=2 * rounds)
         for turn in range(rounds):
             # The order alternates, so that no side always follows the other.
@@ -148,6 +154,7 @@ def measure_latency(*, seconds: float, rounds: int, bundle: str, model: Path, ba
                 time.sleep(SETTLE_S)
                 children.check(names)
                 bar.advance(task)
+        ended_ns = time.monotonic_ns()
         for gate in opened:
             gate.set(True)  # a source that waits at its gate does not see the stop event
         for name in reversed(names):
@@ -156,15 +163,16 @@ def measure_latency(*, seconds: float, rounds: int, bundle: str, model: Path, ba
         stages_s: dict[str, float] = {}
         for out in outs:
             _, rows, _ = read_rows(out)
-            stages_s |= stage_medians(rows)  # the floor notes none
             # Frames before the first estimate had no tare and do not count as lost.
             lost = int(rows[-1, 0] - rows[0, 0] + 1 - len(rows)) if len(rows) else -1
-            if not len(rows):
+            measured = rows[(rows[:, 1] >= begun_ns) & (rows[:, 1] < ended_ns)]
+            if not len(measured):
                 raise LinkError(
                     "no estimate came to the client of the benchmark",
                     remedy=f"see the logs in {children.folder / 'logs'}",
                 )
-            results.append(latency(rows, warm_up=_WARM_UP, lost=lost))
+            stages_s |= stage_medians(measured)  # the floor notes none
+            results.append(latency(measured, warm_up=_WARM_UP, lost=lost))
     return Run(results[_PALPATE], results[_FLOOR], stages_s)
 
 
@@ -218,9 +226,12 @@ def _spread(runs: list[Run], name: str) -> tuple[float, float, float]:
 
 
 def _median(runs: list[Run], side: str) -> dict[str, float]:
-    """Each number of a side, its median over the runs."""
+    """Each number of a side: its median over the runs; the largest and the losses of all runs."""
     sides = [asdict(getattr(run, side)) for run in runs]
-    return {name: float(np.median([one[name] for one in sides])) for name in sides[0]}
+    of_all: dict[str, Callable[[list[float]], float]] = {"max_s": max, "lost": sum}
+    return {
+        name: float(of_all.get(name, np.median)([one[name] for one in sides])) for name in sides[0]
+    }
 
 
 def _print(

@@ -566,10 +566,10 @@ TRIALS = tuple(
             "p99 of others <= 1.1 times, 0 lost, no memory piles up",
             subscriber_frozen,
         ),
-        ("disk full", "told <= 1.5 s, estimates untouched, resumes by itself", disk_full),
+        ("disk full", "told <= 1.5 s, no estimate lost, resumes by itself", disk_full),
         (
             "disk refuses to write",
-            "told <= 1.5 s, estimates untouched, resumes by itself",
+            "told <= 1.5 s, no estimate lost, resumes by itself",
             disk_refuses,
         ),
         (

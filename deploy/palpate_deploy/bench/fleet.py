@@ -196,18 +196,24 @@ def measure_scale(stations: int, seconds: float) -> dict[str, Any]:
                 stop_child(watching, _STOP_S)
                 phases[topic] |= _latency(out, stations)
         stop_child(floor_consumer, _STOP_S)
-        direct_s = _latency(direct, 1)
+        # Of the last phase alone, beside which it stands.
+        direct_s = _latency(direct, 1, since_ns=round(1e9 * began_s))
         return {
             "stations": stations,
             "phases": phases,
             "floor": direct_s,
+            "floor_beside": topics[-1],
             "ratio_p50": phases["electrodes"]["p50_s"] / direct_s["p50_s"],
         }
 
 
-def _latency(out: Path, stations: int) -> dict[str, Any]:
-    """Latency of what a consumer took, and what was lost between its first and last message."""
+def _latency(out: Path, stations: int, *, since_ns: int = 0) -> dict[str, Any]:
+    """Latency of what a consumer took, and what was lost between its first and last message.
+
+    Messages that came before ``since_ns`` [ns], host monotonic clock, are left out.
+    """
     names, rows, _ = read_rows(out)
+    names, rows = names[rows[:, 2] >= since_ns], rows[rows[:, 2] >= since_ns]
     if not len(rows):
         raise LinkError("the consumer heard nothing", remedy="look at the logs of the fleet")
     ages_s = (rows[:, 2] - rows[:, 1]) * 1e-9

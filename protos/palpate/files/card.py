@@ -104,8 +104,8 @@ def _bounds(intervals: Intervals | None) -> list[str]:
         return ["Not known: estimates give no bounds."]
     level = f"{intervals.level:.0%}"
     lines = [
-        f"Each estimate has bounds of its error. They hold in {level} of presses like those that"
-        f" they were learned from: {intervals.source}.",
+        f"Each estimate has bounds of its error. They hold in {level} of the frames of a press, on"
+        f" average over presses like those that they were learned from: {intervals.source}.",
         "",
     ]
     if not intervals.others:

@@ -90,11 +90,12 @@ class QualityFlag(IntEnum):
 class ErrorBounds:
     """How far an estimate may be off: bounds of its errors (docs/adr/0031-intervals.md).
 
-    Without a quality flag each holds in ``level`` of the presses like those it was calibrated on;
-    with one it is a hint.
+    Without a quality flag each holds in ``level`` of the frames of a press, on average over presses
+    like those it was calibrated on; with one it is a hint.
 
     Attributes:
-        level: Share of the errors within a bound, on presses that no training saw.
+        level: Share of the frames of a press whose error is within a bound, on average over presses
+            that no training saw.
         force_magnitude: Of the length of the force [N].
         force: Of the force [N]: the length of the error's vector.
         contact_location: Of the contact location [m], a distance; None without contact, and where

@@ -55,7 +55,8 @@ def test_a_field_bundle_is_as_good_as_it_says(
     assert one.low <= one.value <= one.high
     nodes = figure(found, "displacement_128_nodes")
     assert nodes.value == pytest.approx(metrics["nodal_subset_m"], rel=1e-2)
-    assert nodes.constant == pytest.approx(metrics["zero_nodal_subset_m"], rel=1e-2)
+    assert nodes.zero == pytest.approx(metrics["zero_nodal_subset_m"], rel=1e-2)
+    assert np.isnan(nodes.constant)
     assert found.sha256 == read_bundle(tmp_path / "field").sha256.hex()
     assert not found.trained_on
     other = replace(mixed, mesh=replace(mixed.mesh, sha256="cd" * 32))
@@ -75,7 +76,7 @@ def test_a_synthesis_bundle_is_of_one_specimen(
     path = of_tests(mixed, tmp_path / "test.h5", UNIT)
     one = figure(evaluate(tmp_path / "synthesis", [path], unit=UNIT), "electrodes")
     assert one.value == pytest.approx(metrics["electrode_rmse_counts"], rel=1e-2)
-    assert one.constant > one.value
+    assert one.zero > one.value
     with pytest.raises(DatasetError, match="electrodes of one specimen"):
         evaluate(tmp_path / "synthesis", [path])
     with pytest.raises(DatasetError, match="no 'biotac-9' in it"):
@@ -114,6 +115,32 @@ def test_features_of_both_kinds_of_file_and_of_one_specimen(of_features: Path) -
     assert by_bin[0] == found.rows
     with pytest.raises(DatasetError, match="no 'biotac-9' in it"):
         evaluate(folder / "bundle", [folder / "features.h5"], unit="biotac-9")
+
+
+def test_the_constant_is_the_mean_of_the_rows_of_its_bin_in_all_data_sets(
+    of_features: Path, tmp_path: Path
+) -> None:
+    data = open_dataset(of_features / "features.h5")
+    paths = []
+    for side in (0, 1):
+        rows = np.flatnonzero(data.group % 2 == side)
+        columns: dict[str, Any] = {name: values[rows] for name, values in data.arrays().items()}
+        if side:  # so that the means of the two data sets differ
+            columns["force"] = 3.0 * columns["force"]
+        paths.append(tmp_path / f"{side}.h5")
+        write_dataset(paths[-1], replace(data, **columns))
+    found = evaluate(of_features / "bundle", paths)
+    forces = [one.force[one.in_contact] for one in map(open_dataset, paths)]
+    force = np.concatenate(forces).astype(np.float64)
+    norm = np.linalg.norm(force, axis=1)
+    for where, low, high in (("below_2n", 0.0, 2.0), ("2_to_8n", 2.0, 8.0)):
+        some = (norm >= low) & (norm < high)
+        mean = np.linalg.norm(force[some].mean(axis=0))
+        one = figure(found, "force_magnitude", where)
+        assert one.rows == some.sum() > 0
+        assert one.constant == pytest.approx(np.median(np.abs(norm[some] - mean)), rel=1e-4)
+        assert one.zero == pytest.approx(np.median(norm[some]), rel=1e-4)
+    assert np.isnan(figure(found, "force_angle").zero)
 
 
 def test_a_part_of_the_training_is_known(of_features: Path, tmp_path: Path) -> None:

@@ -182,11 +182,12 @@ def _table(found: BundleErrors) -> Table:
 
     table = Table(
         title=f"{found.bundle}: {found.rows} rows of {found.presses} presses",
-        caption="constant: the mean of these rows, or nothing for fields and electrodes",
+        caption="constant: the mean of these rows; zero: no force, displacement or change",
         box=SIMPLE,
     )
-    for column in ("error", "of rows", "", "95 % over presses", "constant"):
-        table.add_column(column, justify="left" if column in ("error", "of rows") else "right")
+    for column in ("error", "of rows", "", "95 % over presses", "constant", "zero"):
+        left = column in ("error", "of rows")
+        table.add_column(column, justify="left" if left else "right", no_wrap=column != "error")
     for name in dict.fromkeys(one.name for one in found.figures):
         kind = KINDS[name]
         unit, factor = SHOWN.get(kind.unit, (kind.unit, 1.0))
@@ -199,7 +200,7 @@ def _table(found: BundleErrors) -> Table:
                 one.where.replace("_", " ").replace("2n", "2 N").replace("8n", "8 N"),
                 f"{factor * one.value:.3g}",
                 "-" if np.isnan(one.low) else f"{factor * one.low:.3g} to {factor * one.high:.3g}",
-                f"{factor * one.constant:.3g}",
+                *("-" if np.isnan(v) else f"{factor * v:.3g}" for v in (one.constant, one.zero)),
                 end_section=one is rows[-1],
             )
     return table

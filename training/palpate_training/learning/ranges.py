@@ -36,12 +36,14 @@ _FOLDS = 5
 PATTERN_SCALE_COUNTS = 80.0
 PATTERN_SHRINK = 0.0003
 """Compression of the values, and what is added to the variance of each combination over that of one
-term: chosen on each of two real fingers for the other (docs/results/intervals.md)."""
+term: chosen with both real fingers in view. Chosen on each of them for the other, the compression
+is 60 (docs/results/intervals.md)."""
 
 UNLIKE = 0.006
 """Share of the rows of a press held out that may be flagged by the pattern. One per cent of the
 rows of new presses may be flagged in all: rows beyond the training range are flagged, too, and
-presses held out are less strange than new ones (training/LOG.md)."""
+presses held out are less strange than new ones. Chosen on 500 presses at random and on one real
+finger (training/LOG.md)."""
 
 PRESSES_OF_PATTERN = 50
 """Fewer presses do not know 209 combinations."""

@@ -110,8 +110,10 @@ class Figure(NamedTuple):
         low: Lower end of its 95 % confidence interval, presses drawn with replacement; NaN of a
             single press.
         high: Upper end.
-        constant: The same of the best-known constant: the mean of these rows for what features are,
-            nothing for fields and electrodes.
+        constant: The same of a constant, the mean of the true values of these very rows; NaN for
+            fields and electrodes.
+        zero: The same of no force, no displacement and unchanged electrodes; NaN for what cannot be
+            zero: angles and places.
     """
 
     name: str
@@ -122,6 +124,7 @@ class Figure(NamedTuple):
     low: float
     high: float
     constant: float
+    zero: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +180,7 @@ class BundleErrors:
                     "value": number(one.value),
                     "ci95": [number(one.low), number(one.high)],
                     "constant": number(one.constant),
+                    "zero": number(one.zero),
                 }
                 for one in self.figures
             ],
@@ -185,10 +189,15 @@ class BundleErrors:
 
 @dataclass(frozen=True, slots=True)
 class _Errors:
-    """Errors of every row by name, of the bundle and of a constant; force [N] and press of each."""
+    """Errors of every row by name, of the bundle and of nothing; force [N] and press of each.
+
+    ``truth`` holds what a constant is made of, by the name of the output: empty for fields and
+    electrodes.
+    """
 
     found: Mapping[str, Floats]
-    constant: Mapping[str, Floats]
+    zero: Mapping[str, Floats]
+    truth: Mapping[str, FloatArray]
     force_n: Floats
     press: Labels
 
@@ -310,44 +319,54 @@ def _some(rows: Rows, path: Path) -> Rows:
 
 
 def _of_features(bundle: Bundle, data: FeatureDataset, rows: Rows) -> _Errors:
-    tared, truth = data.tared_counts[rows], data.force[rows]
+    tared = data.tared_counts[rows]
     answers = join(answers_of(bundle, lambda part: tared[part], np.arange(len(rows))))
-
-    def errors(given: Callable[[str, FloatArray], FloatArray]) -> dict[str, Floats]:
-        force = force_errors(given("force", truth), truth)
-        found = {
-            "force_magnitude": force["magnitude_n"],
-            "force_magnitude_over_norm": force["magnitude_over_norm"],
-            "force_angle": force["angle_rad"],
-        }
-        for name in OF_CONTACT:
-            wanted = getattr(data, name)
-            if wanted is not None and name in answers:
-                wanted = wanted[rows]
-                estimate = given(name, wanted)
-                found[name] = (
-                    angles(estimate, wanted)
-                    if name == NORMAL
-                    else np.linalg.norm(estimate.astype(np.float64) - wanted, axis=1)
-                )
-        return found
-
+    truth = {"force": data.force[rows]}
+    for name in OF_CONTACT:
+        wanted = getattr(data, name)
+        if wanted is not None and name in answers:
+            truth[name] = wanted[rows]
+    force_n = np.linalg.norm(truth["force"].astype(np.float64), axis=1)
     return _Errors(
-        errors(lambda name, _: answers[name]),
-        errors(_mean_of_rows),
-        np.linalg.norm(truth.astype(np.float64), axis=1),
+        _feature_errors(answers, truth),
+        {"force_magnitude": force_n},
+        truth,
+        force_n,
         press_of(data)[rows],
     )
 
 
-def _mean_of_rows(_: str, wanted: FloatArray) -> FloatArray:
-    return np.broadcast_to(np.nanmean(wanted, axis=0, dtype=np.float32), wanted.shape)
+def _feature_errors(
+    estimate: Mapping[str, FloatArray], truth: Mapping[str, FloatArray]
+) -> dict[str, Floats]:
+    """Errors of every row by name; arrays by the name of the output, ``(N, 3)`` each."""
+    force = force_errors(estimate["force"], truth["force"])
+    found = {
+        "force_magnitude": force["magnitude_n"],
+        "force_magnitude_over_norm": force["magnitude_over_norm"],
+        "force_angle": force["angle_rad"],
+    }
+    for name in OF_CONTACT:
+        if name in truth:
+            found[name] = (
+                angles(estimate[name], truth[name])
+                if name == NORMAL
+                else np.linalg.norm(estimate[name].astype(np.float64) - truth[name], axis=1)
+            )
+    return found
+
+
+def _mean_of_rows(wanted: FloatArray) -> FloatArray:
+    """The mean of the rows that are known, in every row; NaN if none is."""
+    known = wanted[np.isfinite(wanted).all(axis=1)]
+    mean = known.mean(axis=0, dtype=np.float64) if len(known) else np.full(3, np.nan)
+    return np.broadcast_to(mean.astype(wanted.dtype), wanted.shape)
 
 
 def _of_field(bundle: Bundle, data: MixedDataset, rows: Rows) -> _Errors:
     tared = tared_counts(data)
     found: list[dict[str, Floats]] = []
-    constant: list[dict[str, Floats]] = []
+    zero: list[dict[str, Floats]] = []
     subset, nodes = data.mesh.subset, data.mesh.nodes
     outputs = [tensor.name for tensor in bundle.manifest.outputs]
     known = "contact_force" in outputs and data.contact is not None
@@ -360,7 +379,7 @@ def _of_field(bundle: Bundle, data: MixedDataset, rows: Rows) -> _Errors:
             "net": answers["displacement"].reshape(-1, *nodes.shape),
             "none": np.zeros_like(truth),
         }
-        for name, into in (("net", found), ("none", constant)):
+        for name, into in (("net", found), ("none", zero)):
             errors = field_errors(each[name], truth, subset)
             into.append(
                 {"displacement_128_nodes": errors["subset_m"], "displacement": errors["all_m"]}
@@ -368,9 +387,9 @@ def _of_field(bundle: Bundle, data: MixedDataset, rows: Rows) -> _Errors:
         if forces is not None:
             wanted = next(forces)
             estimate = answers["contact_force"].reshape(len(part), -1, 3)[:, data.mesh.outer_nodes]
-            for force, into in ((estimate, found), (np.zeros_like(wanted), constant)):
+            for force, into in ((estimate, found), (np.zeros_like(wanted), zero)):
                 into[-1]["contact_force_misplaced"] = contact_errors(force, wanted)["misplaced"]
-    return _Errors(join(found), join(constant), *_force_and_press(data.experiment, rows))
+    return _Errors(join(found), join(zero), {}, *_force_and_press(data.experiment, rows))
 
 
 def _of_synthesis(bundle: Bundle, data: MixedDataset, rows: Rows) -> _Errors:
@@ -378,11 +397,11 @@ def _of_synthesis(bundle: Bundle, data: MixedDataset, rows: Rows) -> _Errors:
     answers = join(
         answers_of(bundle, lambda part: data.displacement(part).reshape(len(part), -1), rows)
     )
-    found, constant = (
+    found, zero = (
         {"electrodes": electrode_errors(estimate, truth)["mean_square"]}
         for estimate in (answers["tared_counts"], np.zeros_like(truth))
     )
-    return _Errors(found, constant, *_force_and_press(data.experiment, rows))
+    return _Errors(found, zero, {}, *_force_and_press(data.experiment, rows))
 
 
 def _force_and_press(data: ExperimentDataset, rows: Rows) -> tuple[Floats, Labels]:
@@ -404,10 +423,15 @@ def answers_of(
 def _joined(parts: Sequence[_Errors]) -> _Errors:
     """Rows of all data sets; a quantity that one of them does not know is left out."""
     first = np.cumsum([0, *(int(part.press.max()) + 1 for part in parts)])
-    names = [name for name in parts[0].found if all(name in part.found for part in parts)]
+
+    def whole(of: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        names = [name for name in of[0] if all(name in part for part in of)]
+        return {name: np.concatenate([part[name] for part in of]) for name in names}
+
     return _Errors(
-        {name: np.concatenate([part.found[name] for part in parts]) for name in names},
-        {name: np.concatenate([part.constant[name] for part in parts]) for name in names},
+        whole([part.found for part in parts]),
+        whole([part.zero for part in parts]),
+        whole([part.truth for part in parts]),
         np.concatenate([part.force_n for part in parts]),
         np.concatenate([part.press + start for part, start in zip(parts, first, strict=False)]),
     )
@@ -419,6 +443,9 @@ def _figures(errors: _Errors) -> Iterator[Figure]:
         if not len(rows):
             continue
         press = errors.press[rows]
+        truth = {name: of_all[rows] for name, of_all in errors.truth.items()}
+        mean = {name: _mean_of_rows(wanted) for name, wanted in truth.items()}
+        constant = _feature_errors(mean, truth) if truth else {}
         for name, found in errors.found.items():
             statistic = KINDS[name].of
             # Of a single press nobody knows how far the next one is off.
@@ -434,5 +461,6 @@ def _figures(errors: _Errors) -> Iterator[Figure]:
                 len(np.unique(press)),
                 statistic(found[rows]),
                 *ends[name],
-                statistic(errors.constant[name][rows]),
+                statistic(constant[name]) if name in constant else float("nan"),
+                statistic(errors.zero[name][rows]) if name in errors.zero else float("nan"),
             )

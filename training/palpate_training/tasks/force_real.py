@@ -220,6 +220,8 @@ number of blocks belongs to the result; the last rows vary it.
 so are the numbers in the figure's titles and in README.md; the figure shows the estimates of all
 single networks. "mean of n MLPs" averages the networks' estimates row by row instead. Settings were
 chosen on validation blocks and then kept; all models learn from all blocks that are not tested.
+Each validation block is a test block of another fold: of 20 blocks ten are, so the settings were
+chosen on half of the test rows, and the errors may be somewhat too small.
 """
 
 
