@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from palpate.errors import DeviceError
 from palpate_gateway.biotac.finger import FingerDevice, FingerOptions
 from palpate_gateway.biotac.slot_link import SlotSource
 from palpate_gateway.biotac.slots import LineSlots
@@ -38,7 +39,8 @@ class CanOptions(FingerOptions):
         bitrate: [bit/s]; 0 = as the bus is set up.
         bus_options: Further options of python-can; for ``udp_multicast`` also ``listen``, the
             address of the network that is joined: without it only this host is heard.
-        can_id: Identifier of the BioTacs' frames; None = any frame that holds a sampled channel.
+        can_id: Identifier of the BioTacs' frames; None = the only one whose frames repeat a round
+            of sampling, which takes 30 ms at the start even where ``sequence`` is given.
         fingers: Words in each frame.
         slot_rate_hz: Slots each second.
         gather_s: How long slots may wait for the end of their sampling round [s]: waking up for
@@ -69,9 +71,10 @@ class CanSource(SlotSource):
         self._gather_s = options.gather_s
         self._ends_s = 0.0
         self._decoder = CanSlotDecoder(fingers=options.fingers, can_id=options.can_id)
+        self._learns = options.sequence == "learn"
         self._clock = SlotClock(
             slot_rate_hz=options.slot_rate_hz,
-            sequence=None if options.sequence == "learn" else ch.SEQUENCES[options.sequence],
+            sequence=None if self._learns else ch.SEQUENCES[options.sequence],
         )
 
     def open(self) -> None:
@@ -86,12 +89,24 @@ class CanSource(SlotSource):
         """See ``SlotSource``."""
         batch = self._bus.read(timeout_s, gather_s=self._until_the_end_s())
         data, size, arrival_ns = batch.frames.data, batch.frames.size, batch.arrival_ns
-        ours = self._decoder.ours(batch.frames.can_id)
+        ours = self._decoder.ours(batch.frames.can_id, data, size)
+        if len(self._decoder.senders) > 1:
+            one, other = sorted(self._decoder.senders)[:2]
+            raise DeviceError(
+                f"{self._bus.name}: identifiers {one:#x} and {other:#x} both send slots",
+                remedy="name one of them by can_id",
+            )
         if ours is not None:
             data, size, arrival_ns = data[ours], size[ours], arrival_ns[ours]
+        known = bool(self._decoder.senders)
+        if not known and not self._learns:
+            self._clock.counters["unplaced"] += len(size)
+            return None
         words = self._decoder.decode(data, size)
         stamps_s = arrival_ns[words.index].astype(np.float64) * 1e-9
         places = self._clock.place_all(words.channel, stamps_s)
+        if not known:  # the order is learnt meanwhile, from the same slots
+            return None
         slots = LineSlots.placed(words, places, len(self._clock.sequence))
         if slots is not None:
             self._note_times(slots, stamps_s[places.kept])

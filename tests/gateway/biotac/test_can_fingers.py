@@ -16,7 +16,7 @@ from palpate_gateway.emulators.biotac_slots import idle_counts
 from palpate_gateway.protocols.channels import ALL_VALID
 from palpate_gateway.readings import ElectrodeReading
 
-pytest.importorskip("can")
+can = pytest.importorskip("can")
 
 Emulate = Callable[..., BiotacCanEmulator]
 
@@ -92,6 +92,56 @@ def test_silence_is_told_and_counted_as_lost_frames(emulate: Emulate, finger: An
     missed = sum(one.missed_before for one in readings)
     assert 60 <= missed <= 90
     assert_right(read_frames(device, lambda got: len(got) > 10), 0)
+
+
+@pytest.mark.parametrize("sequence", ["learn", "biotac_e1_first"])
+def test_two_senders_of_one_bus_are_no_finger_until_one_is_named(
+    emulate: Emulate, finger: Any, sequence: str
+) -> None:
+    emulate(can_id=0x101)
+    device = finger(sequence=sequence)
+    device.open()
+    assert_right(read_frames(device, lambda got: len(got) > 10), 0)
+    emulate(can_id=0x102, counts=lambda t, index: idle_counts(t, index + 1))
+    readings: list[ElectrodeReading] = []
+    both = "identifiers 0x101 and 0x102 both send slots.*can_id"
+    with pytest.raises(DeviceError, match=both):
+        read_frames(device, lambda got: bool(readings.extend(got)))
+    assert_right(readings, 0)
+    device.close()
+
+    def again() -> None:
+        device.open()
+        read_frames(device, lambda _: False)
+
+    with pytest.raises(DeviceError, match=both):
+        again()
+    named = finger(sequence=sequence, can_id=0x102)
+    named.open()
+    assert_right(read_frames(named, lambda got: len(got) > 10), 1)
+    assert named.counters["other_ids"] > 0
+
+
+def test_another_device_of_the_bus_is_not_taken_for_the_finger(
+    emulate: Emulate, finger: Any, request: pytest.FixtureRequest
+) -> None:
+    device = finger()
+    with can.Bus(interface="virtual", channel=request.node.name) as other:
+
+        def disturb(count: int) -> None:
+            for k in range(count):  # valid words of E1 and E2, behind commands for E9
+                data = bytes.fromhex("B3 0108 0108 0108" if k % 3 else "82 0108 0108 0108")
+                other.send(can.Message(arbitration_id=2, data=data, is_extended_id=False))
+
+        disturb(300)
+        emulate()
+        device.open()
+        readings = []
+        for _ in range(10):
+            disturb(20)
+            readings += read_frames(device, lambda got: len(got) > 2)
+    assert_right(readings, 0)
+    assert device.counters["other_ids"] >= 200
 
 
 def test_nobody_on_the_bus_is_told(finger: Any) -> None:

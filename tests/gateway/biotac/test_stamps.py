@@ -58,7 +58,7 @@ class LateBus:
 
 def stamps_of(bus: LateBus, monkeypatch: pytest.MonkeyPatch) -> tuple[np.ndarray, LiveClock]:
     """Host times of the frames of its first finger [s]."""
-    source = CanSource(CanOptions(interface="virtual", sequence="biotac_e1_first"))
+    source = CanSource(CanOptions(interface="virtual", can_id=1, sequence="biotac_e1_first"))
     monkeypatch.setattr(source, "_bus", bus)
     out: list[float] = []
     assembler, clock = FrameAssembler(source.slot_period_s), LiveClock()
