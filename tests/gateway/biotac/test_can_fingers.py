@@ -141,7 +141,7 @@ def test_another_device_of_the_bus_is_not_taken_for_the_finger(
             disturb(20)
             readings += read_frames(device, lambda got: len(got) > 2)
     assert_right(readings, 0)
-    assert device.counters["other_ids"] >= 200
+    assert device.counters["other_ids"] > 0
 
 
 def test_nobody_on_the_bus_is_told(finger: Any) -> None:
