@@ -185,6 +185,8 @@ class BiotacCan(FingerDevice):
 
     def _line(self) -> tuple[object, object, SlotSource, int]:
         options = self._can
-        key = (options.interface, options.channel, options.can_id)
+        # Two buses may differ in an option only, e.g. in the port of their UDP group.
+        more = (f"{key}={value}" for key, value in sorted(options.bus_options.items()))
+        key = (options.interface, options.channel, options.can_id, *more)
         settings = options.model_dump(exclude={"port", "serial"})
         return key, settings, CanSource(options), options.fingers

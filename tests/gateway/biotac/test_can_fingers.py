@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -54,7 +56,7 @@ def test_three_fingers_of_one_bus(emulate: Emulate, finger: Any, pac_first: bool
 
 def test_an_empty_port_is_no_sensor_and_a_pulled_one_is_lost(emulate: Emulate, finger: Any) -> None:
     emulator = emulate(fingers=2)
-    emulator.inject("absent", 3.0)
+    emulator.inject("absent", 8.0)  # the rate is measured first, for 5 s at most
     with pytest.raises(DeviceLost, match="no finger answers"):
         finger(fingers=2, port=2).open()
     there = finger(fingers=2, port=1)
@@ -158,6 +160,32 @@ def test_one_line_is_configured_alike_and_each_port_once(emulate: Emulate, finge
         finger(port=2, slot_rate_hz=3000.0).open()
     with pytest.raises(ConfigError, match="the line has 2 ports"):
         finger(port=3, fingers=2).open()
+
+
+def test_two_buses_that_differ_in_their_port_only_are_two(finger: Any) -> None:
+    group = {"interface": "udp_multicast", "channel": "239.74.163.5"}
+    with ExitStack() as stack:
+        free = [stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(2)]
+        for one in free:
+            one.bind(("", 0))
+        ports = [one.getsockname()[1] for one in free]
+    devices = []
+    with ExitStack() as stack:
+        for index, port in enumerate(ports):
+
+            def counts(t: float, place: int, index: int = index) -> Sequence[int]:
+                return idle_counts(t, place + index)
+
+            emulator = BiotacCanEmulator(
+                *group.values(), fingers=1, counts=counts, options={"port": port}
+            )
+            stack.enter_context(emulator)
+            devices.append(finger(**group, fingers=1, bus_options={"port": port}))
+            devices[-1].open()
+        for index, device in enumerate(devices):
+            assert_right(read_frames(device, lambda got: len(got) > 5), index)
+        serials = [device.identity.serial for device in devices]
+        assert all(str(port) in serial for port, serial in zip(ports, serials, strict=True))
 
 
 def test_opens_again_after_closing(emulate: Emulate, finger: Any) -> None:
