@@ -210,14 +210,14 @@ class CanSlotDecoder(SlotDecoder):
         if fingers > CAN_FINGERS_MAX:
             raise ValueError(f"{fingers} fingers are not in 1..{CAN_FINGERS_MAX} on a CAN bus")
         super().__init__(fingers=fingers)
-        self._can_id = can_id
-        self._senders = SlotSenders() if can_id is None else None
+        self._named = [] if can_id is None else [can_id]
+        self._senders = SlotSenders()
         self.counters["other_ids"] = 0
 
     @property
     def senders(self) -> Sequence[int]:
         """The given identifier, or those found; none while nobody has shown a round."""
-        return [self._can_id] if self._senders is None else self._senders.found
+        return self._named or self._senders.found
 
     def ours(self, can_id: Ints, payloads: Bytes, sizes: Ints) -> npt.NDArray[np.bool_] | None:
         """Which data frames have our identifier; None = all, or not known yet. Counts the others.
@@ -227,7 +227,7 @@ class CanSlotDecoder(SlotDecoder):
             payloads: See ``decode``.
             sizes: See ``decode``.
         """
-        if self._senders is not None:
+        if not self._named:
             self._senders.look(can_id, payloads, sizes)
         if not self.senders:
             return None

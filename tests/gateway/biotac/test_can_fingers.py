@@ -106,9 +106,14 @@ def test_two_senders_of_one_bus_are_no_finger_until_one_is_named(
     assert_right(read_frames(device, lambda got: len(got) > 10), 0)
     emulate(can_id=0x102, counts=lambda t, index: idle_counts(t, index + 1))
     readings: list[ElectrodeReading] = []
+
+    def keep(got: list[ElectrodeReading]) -> bool:
+        readings[:] = got
+        return False
+
     both = "identifiers 0x101 and 0x102 both send slots.*can_id"
     with pytest.raises(DeviceError, match=both):
-        read_frames(device, lambda got: bool(readings.extend(got)))
+        read_frames(device, keep)
     assert_right(readings, 0)
     device.close()
 
