@@ -209,7 +209,7 @@ class TestNothingIsWritten:
             options={"port": port},
         )
         with slow:
-            done = run("--biotac", on_can(port))
+            done = run("--biotac", on_can(port, "slot_rate_hz=2200"))
         assert done.exit_code == DEVICE
         assert "100 were expected" in done.output
         assert not list(lab.iterdir())

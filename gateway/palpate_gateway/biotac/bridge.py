@@ -6,6 +6,7 @@ brings serial numbers and slot rate. A reference firmware is in ``deploy/firmwar
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 
@@ -44,7 +45,8 @@ class BridgeOptions(FingerOptions):
         baud: [bit/s]; nominal on USB-CDC.
         source: The bridge's id; None = any, but only one on the line.
         hello_s: How long to wait for a HELLO after the first packet [s]; longer than the time
-            between two of them. Without it serial numbers stay unknown.
+            between two of them. One that comes later opens the bridge again. 0 = not at all: serial
+            numbers stay unknown.
     """
 
     line: str = Field(min_length=1)
@@ -69,6 +71,7 @@ class BridgeSource(SlotSource):
         self._source: int | None = None
         self._epoch: int | None = None
         self._hello: BridgeHello | None = None
+        self._without = False  # opened without a HELLO
         self._status: tuple[BridgeStatus, BridgeStatus] | None = None
         self._foreign = 0
         self._end: DeviceError | None = None
@@ -101,6 +104,7 @@ class BridgeSource(SlotSource):
                 heard, due_s = True, time.monotonic() + self._hello_s
             if time.monotonic() >= due_s:
                 if heard:
+                    self._without = True
                     return
                 raise self._no_packet()
             try:
@@ -189,6 +193,14 @@ class BridgeSource(SlotSource):
             raise DeviceLost(
                 f"{self._port.name}: fingers or rate of the bridge have changed",
                 remedy="it is opened again by itself",
+            )
+        other_rate = not math.isclose(hello.slot_rate_hz * self.slot_period_s, 1.0)
+        if self._without and (other_rate or self._hello_s > 0.0):
+            raise DeviceLost(
+                f"{self._port.name}: the bridge's HELLO came later than hello_s = "
+                f"{self._hello_s:g} s",
+                remedy="it is opened again by itself, with serial numbers and rate; if this "
+                "repeats, raise hello_s",
             )
         self.fingers = len(hello.fingers)
         if known is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -9,8 +10,10 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.biotac.finger import FingerDevice, FingerOptions
 from palpate_gateway.biotac.slot_link import SlotSource
+from palpate_gateway.biotac.slot_rate import RATE_S, SlotRate
 from palpate_gateway.biotac.slots import LineSlots
 from palpate_gateway.ports.can_bus import CanBus
 from palpate_gateway.protocols import channels as ch
@@ -25,6 +28,9 @@ _LATE_S = 2e-4
 _SCATTER_S = 3e-3
 """Longest wait for late slots of a round, however much earlier ones were late [s]."""
 
+_RATE_PATIENCE_S = 5.0
+"""Longest time in which the rate of slots is measured before the first is delivered [s]."""
+
 _UNKNOWN_S = 2e-3
 """How long slots wait for more while their place in the round is unknown [s]."""
 
@@ -38,9 +44,10 @@ class CanOptions(FingerOptions):
         bitrate: [bit/s]; 0 = as the bus is set up.
         bus_options: Further options of python-can; for ``udp_multicast`` also ``listen``, the
             address of the network that is joined: without it only this host is heard.
-        can_id: Identifier of the BioTacs' frames; None = any frame that holds a sampled channel.
+        can_id: Identifier of the BioTacs' frames; None = the only one whose frames repeat a round
+            of sampling, which takes 30 ms at the start even where ``sequence`` is given.
         fingers: Words in each frame.
-        slot_rate_hz: Slots each second.
+        slot_rate_hz: Slots each second by the sender's clock; a bus that brings others is refused.
         gather_s: How long slots may wait for the end of their sampling round [s]: waking up for
             each of 4400 slots a second would take most of the processor time. 0 = not at all.
     """
@@ -56,7 +63,7 @@ class CanOptions(FingerOptions):
 
 
 class CanSource(SlotSource):
-    """The CAN bus as a source of slots."""
+    """The CAN bus as a source of slots. It is opened once; reopening needs a new object."""
 
     def __init__(self, options: CanOptions) -> None:
         self.slot_period_s = 1.0 / options.slot_rate_hz
@@ -69,14 +76,31 @@ class CanSource(SlotSource):
         self._gather_s = options.gather_s
         self._ends_s = 0.0
         self._decoder = CanSlotDecoder(fingers=options.fingers, can_id=options.can_id)
-        self._clock = SlotClock(
-            slot_rate_hz=options.slot_rate_hz,
-            sequence=None if options.sequence == "learn" else ch.SEQUENCES[options.sequence],
-        )
+        self._sequence = None if options.sequence == "learn" else ch.SEQUENCES[options.sequence]
+        self._rate_hz = options.slot_rate_hz
+        self._rate = SlotRate(self._rate_hz)
+        self._clock = self._new_clock()
+
+    def _new_clock(self) -> SlotClock:
+        return SlotClock(slot_rate_hz=self._rate_hz, sequence=self._sequence)
 
     def open(self) -> None:
-        """See ``SlotSource``."""
+        """See ``SlotSource``; measures the rate of slots first."""
         self._bus.open()
+        try:
+            self._wait_for_rate()
+        except BaseException:
+            self.close()
+            raise
+
+    def _wait_for_rate(self) -> None:
+        # With a wrong rate every time would be wrong: no finger may see a slot until it is known.
+        until = time.monotonic() + _RATE_PATIENCE_S
+        with contextlib.suppress(DeviceTimeout):
+            while not self._rate.right and time.monotonic() < until:
+                self.read(RATE_S)
+        self._clock = self._new_clock()
+        self._rate.begin()
 
     def close(self) -> None:
         """See ``SlotSource``."""
@@ -86,16 +110,38 @@ class CanSource(SlotSource):
         """See ``SlotSource``."""
         batch = self._bus.read(timeout_s, gather_s=self._until_the_end_s())
         data, size, arrival_ns = batch.frames.data, batch.frames.size, batch.arrival_ns
-        ours = self._decoder.ours(batch.frames.can_id)
+        ours = self._decoder.ours(batch.frames.can_id, data, size)
+        if len(self._decoder.senders) > 1:
+            one, other = sorted(self._decoder.senders)[:2]
+            raise DeviceError(
+                f"{self._bus.name}: identifiers {one:#x} and {other:#x} both send slots",
+                remedy="name one of them by can_id",
+            )
         if ours is not None:
             data, size, arrival_ns = data[ours], size[ours], arrival_ns[ours]
+        known = bool(self._decoder.senders)
+        if not known and self._sequence is not None:
+            self._clock.counters["unplaced"] += len(size)
+            return None
         words = self._decoder.decode(data, size)
         stamps_s = arrival_ns[words.index].astype(np.float64) * 1e-9
         places = self._clock.place_all(words.channel, stamps_s)
+        if not known:  # the order is learnt meanwhile, from the same slots
+            return None
         slots = LineSlots.placed(words, places, len(self._clock.sequence))
         if slots is not None:
             self._note_times(slots, stamps_s[places.kept])
+            self._check_rate(float(stamps_s[places.kept[-1]]))
         return slots
+
+    def _check_rate(self, stamp_s: float) -> None:
+        counters = self._clock.counters
+        wrong_hz = self._rate.follow(counters["placed"], counters["lost_slots"], stamp_s)
+        if wrong_hz is not None:
+            raise DeviceLost(
+                f"{self._bus.name}: {wrong_hz:.0f} slots come each second, not {self._rate_hz:g}",
+                remedy="set slot_rate_hz to what comes, or correct the sender",
+            )
 
     def _note_times(self, slots: LineSlots, stamps_s: Floats) -> None:
         late_s = stamps_s - slots.time_s
@@ -139,6 +185,8 @@ class BiotacCan(FingerDevice):
 
     def _line(self) -> tuple[object, object, SlotSource, int]:
         options = self._can
-        key = (options.interface, options.channel, options.can_id)
+        # Two buses may differ in an option only, e.g. in the port of their UDP group.
+        more = (f"{key}={value}" for key, value in sorted(options.bus_options.items()))
+        key = (options.interface, options.channel, options.can_id, *more)
         settings = options.model_dump(exclude={"port", "serial"})
         return key, settings, CanSource(options), options.fingers

@@ -127,7 +127,10 @@ class SlotLink:
     """An open line and the fingers on it; fingers join by ``join``."""
 
     _open: ClassVar[dict[Hashable, SlotLink]] = {}
-    _guard: ClassVar[threading.Lock] = threading.Lock()
+    # One for each line, held while it is opened or closed: that can take seconds, and no other line
+    # may wait for it.
+    _locks: ClassVar[dict[Hashable, threading.Lock]] = {}
+    _locks_guard: ClassVar[threading.Lock] = threading.Lock()
 
     def __init__(self, key: Hashable, settings: object, source: SlotSource) -> None:
         self._key, self._settings, self.source = key, settings, source
@@ -137,6 +140,11 @@ class SlotLink:
         self._failed = False
         self._begun: list[LineSlots] = []  # slots of the frame that has not ended
         self._thread = threading.Thread(target=self._run, name=f"line {key}", daemon=True)
+
+    @classmethod
+    def _lock_of(cls, key: Hashable) -> threading.Lock:
+        with cls._locks_guard:
+            return cls._locks.setdefault(key, threading.Lock())
 
     @classmethod
     def join(cls, key: Hashable, settings: object, source: SlotSource, index: int) -> FingerQueue:
@@ -152,7 +160,7 @@ class SlotLink:
             ConfigError: The finger has been joined already, or the settings differ.
             DeviceError: The line cannot be opened.
         """
-        with cls._guard:
+        with cls._lock_of(key):
             link = cls._open.get(key)
             # A line that failed stays in the table until its last finger leaves it.
             if link is not None and link._failed:
@@ -180,7 +188,7 @@ class SlotLink:
 
     def leave(self, finger: FingerQueue) -> None:
         """A finger leaves."""
-        with self._guard:
+        with self._lock_of(self._key):
             with self.news:
                 if self._fingers.get(finger.index) is finger:
                     del self._fingers[finger.index]

@@ -20,7 +20,7 @@ DATA_MAX = 8
 """Bytes of a classic CAN frame."""
 
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
-_STANDARD_MASK, _EXTENDED_MASK = 0x7FF, 0x1FFFFFFF
+_STANDARD_MASK, _ERROR_MASK = 0x7FF, 0x1FFFFFFF
 
 # struct can_frame of Linux.
 _FRAME = np.dtype([("word", "=u4"), ("size", "u1"), ("pad", "u1", 3), ("data", "u1", DATA_MAX)])
@@ -32,7 +32,10 @@ class FrameKind(IntEnum):
     DATA = 0
     ERROR = 1
     OTHER = 2
-    """A remote frame, CAN FD, or no CAN frame at all."""
+    """A remote frame, CAN FD, a 29-bit identifier, or no CAN frame at all.
+
+    No device of ours sends 29-bit identifiers, and one of them may equal an 11-bit one.
+    """
 
 
 class CanFrame(NamedTuple):
@@ -88,9 +91,9 @@ def from_socketcan(batch: DatagramBatch) -> CanFrames:
     kind = np.full(len(batch), FrameKind.DATA, np.uint8)
     kind[(word & _ERROR) != 0] = FrameKind.ERROR
     other = (batch.size != _FRAME.itemsize) | (fields["size"] > DATA_MAX)
-    kind[other | ((word & (_REMOTE | _ERROR)) == _REMOTE)] = FrameKind.OTHER
-    short = (word & (_EXTENDED | _ERROR)) == 0
-    can_id = word & np.where(short, np.uint32(_STANDARD_MASK), np.uint32(_EXTENDED_MASK))
+    no_error = (word & _ERROR) == 0
+    kind[other | no_error & ((word & (_REMOTE | _EXTENDED)) != 0)] = FrameKind.OTHER
+    can_id = word & np.where(no_error, np.uint32(_STANDARD_MASK), np.uint32(_ERROR_MASK))
     size = np.where(other, 0, fields["size"]).astype(np.int64)
     data = fields["data"] * (np.arange(DATA_MAX) < size[:, None])
     return CanFrames(kind, can_id.astype(np.int64), size, data.astype(np.uint8))
@@ -169,10 +172,10 @@ class MulticastReader:
             can_id, data = fields["arbitration_id"], fields["data"]
             if fields["is_error_frame"]:
                 return CanFrame(FrameKind.ERROR, int(can_id), bytes(data or b"")[:DATA_MAX])
-            if fields["is_remote_frame"] or fields["is_fd"]:
+            if fields["is_remote_frame"] or fields["is_fd"] or fields["is_extended_id"]:
                 return NOTHING
             if type(can_id) is int and type(data) is bytes and len(data) <= DATA_MAX:
-                return CanFrame(FrameKind.DATA, can_id & _EXTENDED_MASK, data)
+                return CanFrame(FrameKind.DATA, can_id & _STANDARD_MASK, data)
         # Any host may send anything to the group; msgpack alone has six kinds of errors for that.
         except Exception:
             return NOTHING
@@ -184,6 +187,8 @@ def from_message(message: Any) -> CanFrame:
     data = bytes(message.data)
     if message.is_error_frame:
         return CanFrame(FrameKind.ERROR, message.arbitration_id, data[:DATA_MAX])
-    if message.is_remote_frame or message.is_fd or len(data) > DATA_MAX:
+    if message.is_remote_frame or message.is_fd or message.is_extended_id:
+        return NOTHING
+    if len(data) > DATA_MAX:
         return NOTHING
     return CanFrame(FrameKind.DATA, message.arbitration_id, data)

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import select
+import time
 from typing import Any
 
 from palpate.errors import DeviceError, DeviceLost
@@ -14,6 +15,12 @@ from palpate_gateway.ports.port import Port, silent
 
 _AT_ONCE = 65536
 """Most bytes of one read."""
+
+_TAKEN_S = 1.0
+"""Longest time in which the device must take what is written [s]; requests are a few bytes."""
+
+_POLL_S = 5e-4
+"""Time between two looks at what has not left yet [s]: the system does not tell its end."""
 
 _REMEDIES = {
     errno.ENOENT: "plug it in, or name another port (palpate gateway list shows what is there)",
@@ -38,6 +45,7 @@ class SerialPort(Port):
         self._baud, self._rts_cts = baud, rts_cts
         self._line: Any = None
         self._file = False
+        self._stuck = False
         self._broken: tuple[type[Exception], ...] = (OSError,)
 
     def open(self) -> None:
@@ -61,7 +69,7 @@ class SerialPort(Port):
         # Otherwise USB adapters hold bytes back for 16 ms; not every kind of line has this mode.
         with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
             line.set_low_latency_mode(True)
-        self._line = line
+        self._line, self._stuck = line, False
         self._file = os.name == "posix" and "://" not in self.name
 
     def close(self) -> None:
@@ -104,10 +112,38 @@ class SerialPort(Port):
         """See ``Port``."""
         line = self._opened()
         try:
-            line.write(data)
-            line.flush()
+            if self._file:
+                self._give(line, memoryview(data))
+            else:
+                line.write(data)
+                line.flush()
         except self._broken as error:
+            if isinstance(error, DeviceError):
+                raise
             raise self._lost(error) from error
+
+    def _give(self, line: Any, data: memoryview) -> None:
+        """Write to a device file, and wait until all has left it.
+
+        Neither ``write`` nor ``flush`` of pyserial ends while the other side takes nothing.
+        """
+        until = time.monotonic() + (0.0 if self._stuck else _TAKEN_S)
+        while data or line.out_waiting:
+            left_s = until - time.monotonic()
+            if left_s <= 0.0:
+                # Else the system would wait for half a minute when the file is closed.
+                line.reset_output_buffer()
+                self._stuck = True
+                raise DeviceLost(
+                    f"{self.name}: it takes no bytes for {_TAKEN_S:g} s",
+                    remedy="check its power, and RTS/CTS; it is opened again by itself",
+                )
+            if not data:
+                time.sleep(_POLL_S)
+                continue
+            _, ready, _ = select.select([], [line], [], left_s)
+            with contextlib.suppress(BlockingIOError):
+                data = data[os.write(line.fileno(), data) :] if ready else data
 
     def _opened(self) -> Any:
         if self._line is None:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate_gateway.protocols import channels as ch
+from palpate_gateway.protocols.slot_clock import LEARNT_FROM, learn_order
 from palpate_gateway.protocols.spi import (
     ERROR_BYTE,
     ERROR_WORDS,
@@ -165,27 +166,72 @@ def payload_rows(payloads: Sequence[bytes]) -> tuple[Bytes, Ints]:
     return np.frombuffer(data, np.uint8).reshape(len(payloads), width), sizes
 
 
+class SlotSenders:
+    """Finds the identifiers of a bus that send slots: their commands repeat a round.
+
+    A single frame does not tell: the first byte of any device's may be a sampling command.
+    """
+
+    def __init__(self) -> None:
+        self.found: list[int] = []
+        """Those that have shown a round, the first one first."""
+        self._seen: dict[int, list[int]] = {}
+
+    def look(self, can_id: Ints, payloads: Bytes, sizes: Ints) -> None:
+        """Look at data frames; see ``CanSlotDecoder.ours``."""
+        channel = _CHANNEL_OF[payloads[:, 0]]
+        new = (channel >= 0) & (sizes > 0)
+        for found in self.found:
+            new &= can_id != found
+        for sender, one in zip(can_id[new].tolist(), channel[new].tolist(), strict=True):
+            if sender in self.found:
+                continue
+            seen = self._seen.setdefault(sender, [])
+            seen.append(one)
+            if len(seen) < LEARNT_FROM:
+                continue
+            order = learn_order(seen)
+            # A device whose first byte is always the same repeats a cycle of one.
+            if order is not None and order.size > 1:
+                self.found.append(sender)
+            del seen[: LEARNT_FROM // 2]
+
+
 class CanSlotDecoder(SlotDecoder):
     """Slots out of the data frames of a CAN bus; takes no error and no remote frames.
 
     Args:
         fingers: Words that each frame must have at least, 1..3.
-        can_id: Identifier of the frames. The format names none; None takes every frame whose first
-            byte is a sampling command with a known index.
+        can_id: Identifier of the frames. The format names none; None takes that of the first
+            frames that repeat a round, see ``SlotSenders``.
     """
 
     def __init__(self, *, fingers: int, can_id: int | None = None) -> None:
         if fingers > CAN_FINGERS_MAX:
             raise ValueError(f"{fingers} fingers are not in 1..{CAN_FINGERS_MAX} on a CAN bus")
         super().__init__(fingers=fingers)
-        self._can_id = can_id
+        self._named = [] if can_id is None else [can_id]
+        self._senders = SlotSenders()
         self.counters["other_ids"] = 0
 
-    def ours(self, can_id: Ints) -> npt.NDArray[np.bool_] | None:
-        """Which data frames have our identifier; None = all. Counts the others."""
-        if self._can_id is None:
+    @property
+    def senders(self) -> Sequence[int]:
+        """The given identifier, or those found; none while nobody has shown a round."""
+        return self._named or self._senders.found
+
+    def ours(self, can_id: Ints, payloads: Bytes, sizes: Ints) -> npt.NDArray[np.bool_] | None:
+        """Which data frames have our identifier; None = all, or not known yet. Counts the others.
+
+        Args:
+            can_id: Identifiers, shape ``(N,)``.
+            payloads: See ``decode``.
+            sizes: See ``decode``.
+        """
+        if not self._named:
+            self._senders.look(can_id, payloads, sizes)
+        if not self.senders:
             return None
-        ours: npt.NDArray[np.bool_] = can_id == self._can_id
+        ours: npt.NDArray[np.bool_] = can_id == self.senders[0]
         others = int(len(ours) - np.count_nonzero(ours))
         self.counters["other_ids"] += others
         return ours if others else None

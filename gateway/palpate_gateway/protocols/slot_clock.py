@@ -61,7 +61,7 @@ class SlotPlaces:
         return len(self.kept)
 
 
-_LEARNT_FROM = 128
+LEARNT_FROM = 128
 """Slots in a row that must repeat before their order is accepted: two cycles of up to 64."""
 
 _SCATTER_S = 2e-3
@@ -155,7 +155,7 @@ class SlotClock:
         self._exact = exact
         self._learns = sequence is None
         self._order = None if sequence is None else SlotOrder(sequence)
-        self._seen: deque[int] = deque(maxlen=_LEARNT_FROM)
+        self._seen: deque[int] = deque(maxlen=LEARNT_FROM)
         self._doubt = self._learns
         self._run = -1
         self._base = 0  # number of the first frame of this run
@@ -274,12 +274,12 @@ class SlotClock:
 
     def _learn(self, channel: int) -> None:
         self._seen.append(channel)
-        if not self._doubt or len(self._seen) < _LEARNT_FROM:
+        if not self._doubt or len(self._seen) < LEARNT_FROM:
             return
         order = learn_order(tuple(self._seen))
         if order is None:
             # Comparing again at each further slot would cost too much time.
-            for _ in range(_LEARNT_FROM // 2):
+            for _ in range(LEARNT_FROM // 2):
                 self._seen.popleft()
             return
         self._doubt = False

@@ -22,11 +22,18 @@ def check(data: bytes) -> None:
     fingers = 1 + (data[0] if data else 0) % FINGERS_MAX
     _check_words(parts(data[1:]), fingers)
     _check_order(data[1:])
-    bus = CanSlotDecoder(fingers=1, can_id=data[0] if data else None)
-    ours = bus.ours(np.frombuffer(data, np.uint8).astype(np.int64))
+    for given in (None, data[0] if data else 0):
+        _check_identifiers(data, CanSlotDecoder(fingers=1, can_id=given))
+
+
+def _check_identifiers(data: bytes, bus: CanSlotDecoder) -> None:
+    """Each byte is an identifier, and the first byte of its frame."""
+    can_id = np.frombuffer(data, np.uint8).astype(np.int64)
+    ours = bus.ours(can_id, can_id.astype(np.uint8)[:, None], np.ones(len(data), np.int64))
     told = len(data) if ours is None else int(ours.sum())
+    # Of one identifier comes one channel only, which is no round.
+    assert told == (data.count(bytes(bus.senders)) if bus.senders else len(data))
     assert bus.counters["other_ids"] == len(data) - told
-    assert told == data.count(data[:1]) if data else ours is None
 
 
 def _check_words(payloads: list[bytes], fingers: int) -> None:

@@ -100,6 +100,36 @@ def test_a_slower_bridge_tells_its_rate(emulate: Emulate, finger: FingerQueue) -
     assert np.median(times) == pytest.approx(0.02, abs=1e-6)
 
 
+def wait_for_packets(emulator: BiotacBridgeEmulator, count: int) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while emulator.sent < count:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_a_late_hello_opens_the_bridge_again(emulate: Emulate, finger: FingerQueue) -> None:
+    emulator = emulate(slot_rate_hz=4000.0, hello_s=3.0)
+    wait_for_packets(emulator, 30)  # the HELLO at its start is gone
+    hasty = finger(emulator.address, hello_s=0.1)
+    hasty.open()
+    assert hasty.identity.serial.endswith("port1")
+    with pytest.raises(DeviceLost, match=r"HELLO came later than hello_s = 0\.1 s.*raise hello_s"):
+        read_frames(hasty, lambda _: False)
+    hasty.close()
+    patient = finger(emulator.address, hello_s=PATIENCE_S)
+    patient.open()
+    assert patient.identity.serial == "BT-EMU-1"
+    assert patient.identity.slot_period_s == pytest.approx(1 / 4000)
+
+
+def test_without_a_wait_a_hello_may_come_at_any_time(emulate: Emulate, finger: FingerQueue) -> None:
+    emulator = emulate(hello_s=0.3)
+    wait_for_packets(emulator, 10)
+    device = finger(emulator.address, hello_s=0.0)
+    device.open()
+    assert_right(read_frames(device, lambda got: len(got) > 100), 0)
+
+
 def test_a_fast_clock_is_the_time_of_the_frames(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate()
     emulator.inject("clock_drift", 30.0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.errors import DeviceTimeout
+from palpate.errors import DeviceError, DeviceTimeout
 from palpate.messages import BIOTAC_LAYOUT
 from palpate_gateway.biotac.can_fingers import CanOptions, CanSource
 from palpate_gateway.biotac.frames import FrameAssembler
@@ -43,6 +43,13 @@ class LateBus:
         self._arrivals_ns = (self.read_s[kept] * 1e9).round().astype(np.int64)
         self._at = 0
         self.counters: dict[str, int] = {}
+        self.name = "a late bus"
+
+    def open(self) -> None:
+        """It is."""
+
+    def close(self) -> None:
+        """It needs not be."""
 
     def read(self, timeout_s: float, *, gather_s: float = 0.0) -> CanBatch:
         """All that came with the next one."""
@@ -58,7 +65,7 @@ class LateBus:
 
 def stamps_of(bus: LateBus, monkeypatch: pytest.MonkeyPatch) -> tuple[np.ndarray, LiveClock]:
     """Host times of the frames of its first finger [s]."""
-    source = CanSource(CanOptions(interface="virtual", sequence="biotac_e1_first"))
+    source = CanSource(CanOptions(interface="virtual", can_id=1, sequence="biotac_e1_first"))
     monkeypatch.setattr(source, "_bus", bus)
     out: list[float] = []
     assembler, clock = FrameAssembler(source.slot_period_s), LiveClock()
@@ -92,6 +99,24 @@ def test_a_frame_is_stamped_with_the_instant_of_its_first_slot(
     gauges = clock.gauges()
     assert gauges["clock_drift_ppm"] == pytest.approx(fast_ppm, abs=20.0)
     assert 9e-3 < gauges["clock_delay_p50_s"] < 13e-3
+
+
+@pytest.mark.parametrize("fast_ppm", [-110_000.0, -45_000.0, 45_000.0])
+def test_no_slot_is_delivered_while_the_rate_is_wrong(
+    fast_ppm: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = CanSource(CanOptions(interface="virtual"))
+    monkeypatch.setattr(wrong, "_bus", LateBus(4.0, fast_ppm))
+    come_hz = 1.0 / (SLOT_S * (1.0 - 1e-6 * fast_ppm))
+    with pytest.raises(DeviceError, match=r"slots come each second, not 4400.*set slot_rate_hz"):
+        wrong.open()
+    right = CanSource(CanOptions(interface="virtual", slot_rate_hz=round(come_hz)))
+    monkeypatch.setattr(right, "_bus", LateBus(4.0, fast_ppm))
+    right.open()
+    first = None
+    while first is None:
+        first = right.read(0.0)
+    assert (first.position[0], right.counters(0)["lost_frames"]) == (0, 0)
 
 
 def test_a_lost_first_slot_does_not_move_the_stamp(monkeypatch: pytest.MonkeyPatch) -> None:

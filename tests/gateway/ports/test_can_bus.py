@@ -206,9 +206,17 @@ def test_two_senders_of_one_bus_are_told_apart(where: dict[str, Any], bus: CanBu
         for k in range(20):
             one.send(can.Message(arbitration_id=1, data=bytes([k] * 7), is_extended_id=False))
             if k % 3 == 0:
-                other.send(can.Message(arbitration_id=0x1FFFF, data=bytes([k] * 2)))
+                other.send(can.Message(arbitration_id=2, data=bytes([k] * 2), is_extended_id=False))
         got = read(bus, 27)
     assert sorted(m.data for m in got if m.can_id == 1) == [bytes([k] * 7) for k in range(20)]
-    assert sorted(m.data for m in got if m.can_id == 0x1FFFF) == [
-        bytes([k] * 2) for k in range(0, 20, 3)
-    ]
+    assert sorted(m.data for m in got if m.can_id == 2) == [bytes([k] * 2) for k in range(0, 20, 3)]
+
+
+def test_a_29_bit_identifier_is_not_the_11_bit_one_of_the_same_number(
+    sender: Any, bus: CanBus
+) -> None:
+    for k in range(6):
+        extended = k % 2 == 1
+        sender.send(can.Message(arbitration_id=5, data=bytes([k]), is_extended_id=extended))
+    assert [(m.can_id, m.data[0]) for m in read(bus, 3, gather_s=0.02)] == [(5, 0), (5, 2), (5, 4)]
+    assert bus.counters["other_frames"] == 3

@@ -160,8 +160,10 @@ def test_it_can_be_waited_for(pair: tuple[socket.socket, Datagrams]) -> None:
         # struct can_frame: identifier and flags, size, three bytes of padding, data.
         ("01000000 07 000000 A27FC17FC17FC100", (FrameKind.DATA, 1, "A27FC17FC17FC1")),
         ("FF070000 00 000000 0000000000000000", (FrameKind.DATA, 0x7FF, "")),
-        ("23010080 08 000000 0102030405060708", (FrameKind.DATA, 0x123, "0102030405060708")),
+        ("23010000 08 000000 0102030405060708", (FrameKind.DATA, 0x123, "0102030405060708")),
         ("40000020 08 000000 0000000000000000", (FrameKind.ERROR, BUS_OFF, "00" * 8)),
+        ("400000A0 08 000000 0000000000000000", (FrameKind.ERROR, BUS_OFF, "00" * 8)),
+        ("02000080 08 000000 0102030405060708", None),  # a 29-bit identifier, the same as good's
         ("01000040 02 000000 0000000000000000", None),  # remote
         ("01000000 09 000000 0000000000000000", None),  # no such size
         ("01000000", None),
@@ -187,8 +189,8 @@ def test_any_bytes_are_frames_or_none(raw: list[bytes]) -> None:
 MESSAGES: st.SearchStrategy[dict[str, object]] = st.builds(
     dict,
     timestamp=st.floats(allow_nan=False),
-    arbitration_id=st.sampled_from([1, 2, 0x7FF, 0x1FFFFFFF]),
-    is_extended_id=st.booleans(),
+    arbitration_id=st.sampled_from([1, 2, 0x7FF]),
+    is_extended_id=st.sampled_from([False] * 9 + [True]),
     is_remote_frame=st.sampled_from([False] * 9 + [True]),
     is_error_frame=st.sampled_from([False] * 9 + [True]),
     # A name that holds what is searched for.
@@ -209,9 +211,8 @@ def test_frames_like_the_last_are_read_as_if_each_were_unpacked(
         raw = [pack(message) for message in batch] + ([junk] if junk else [])
         alone = [rows(MulticastReader()(waiting_of(one)))[0] for one in raw]
         for frame, message in zip(alone, batch, strict=False):
-            plain = not (
-                message["is_error_frame"] or message["is_remote_frame"] or message["is_fd"]
-            )
+            special = ("is_error_frame", "is_remote_frame", "is_fd", "is_extended_id")
+            plain = not any(message[one] for one in special)
             assert (frame.kind is FrameKind.DATA) == plain
             if plain:
                 assert (frame.can_id, frame.data) == (message["arbitration_id"], message["data"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import termios
 import threading
 import time
 import tty
@@ -62,6 +63,34 @@ def test_the_first_byte_ends_the_wait(plug: Plug) -> None:
             got += port.read(10.0)
         later.join()
     assert got == b"now"
+
+
+def test_a_device_that_takes_nothing_is_told_and_asked_no_more(plug: Plug) -> None:
+    with SerialPort(plug.name, 230400) as port:
+        os.set_blocking(plug.device, False)
+        # As by a low CTS: the line's output is stopped, and nothing leaves it.
+        stopped = os.open(plug.name, os.O_RDWR | os.O_NOCTTY)
+        termios.tcflow(stopped, termios.TCOOFF)
+        with pytest.raises(DeviceLost, match=r"takes no bytes for 1 s.*RTS/CTS"):
+            port.write(b"one")
+        termios.tcflow(stopped, termios.TCOON)
+        os.close(stopped)
+        with pytest.raises(DeviceLost, match="takes no bytes"):
+            port.write(b"two")
+        with pytest.raises(BlockingIOError):
+            os.read(plug.device, 100)
+        port.close()
+        port.open()
+        port.write(b"three")
+        assert os.read(plug.device, 100) == b"three"
+
+
+def test_a_device_that_does_not_read_any_more_is_told(plug: Plug) -> None:
+    with (
+        SerialPort(plug.name, 230400) as port,
+        pytest.raises(DeviceLost, match="takes no bytes"),
+    ):
+        port.write(bytes(1 << 20))
 
 
 def test_silence_is_a_timeout_and_reading_goes_on(plug: Plug) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -45,6 +47,15 @@ def decode(decoder: SlotDecoder, *payloads: bytes) -> list[Told]:
     return list(zip(*columns, strict=True))
 
 
+def ours(
+    decoder: CanSlotDecoder, can_ids: list[int], commands: list[int], sizes: Sequence[int] = ()
+) -> list[bool] | None:
+    """Which frames with these identifiers and first bytes are ours."""
+    size = np.array(sizes or [7] * len(can_ids))
+    mask = decoder.ours(np.array(can_ids), np.array(commands, np.uint8)[:, None], size)
+    return None if mask is None else mask.tolist()
+
+
 def slot(channel: int, *words: str) -> bytes:
     return bytes((spi_words.command_byte(channel),)) + bytes.fromhex("".join(words))
 
@@ -59,7 +70,7 @@ def test_candump_line() -> None:
     line = "(1436509052.249713) can0 001#807FC17FC17FC1"
     can_id, data = line.split()[2].split("#")
     decoder = CanSlotDecoder(fingers=3, can_id=0x001)
-    assert decoder.ours(np.array([int(can_id, 16)])) is None
+    assert ours(decoder, [int(can_id, 16)], [0x80]) is None
     ((_, values, _),) = decode(decoder, bytes.fromhex(data))
     assert values == [2040] * 3
 
@@ -143,11 +154,44 @@ def test_longer_frames_are_taken() -> None:
 
 def test_identifier() -> None:
     decoder = CanSlotDecoder(fingers=3, can_id=0x123)
-    ours = decoder.ours(np.array([0x124, 0x123]))
-    assert ours is not None
-    assert ours.tolist() == [False, True]
+    assert ours(decoder, [0x124, 0x123], [0x80, 0x80]) == [False, True]
     assert decoder.counters["other_ids"] == 1
-    assert CanSlotDecoder(fingers=3).ours(np.array([0, 0x7FF, 0x1FFFFFFF])) is None
+    assert decoder.senders == [0x123]
+
+
+ROUND = [spi_words.command_byte(one) for one in ch.SEQUENCES["biotac_e1_first"]]
+
+
+def test_the_identifier_of_the_frames_that_repeat_a_round_is_found() -> None:
+    decoder = CanSlotDecoder(fingers=1)
+    noise = np.random.default_rng(0)
+    for k in range(400):
+        # Another device's measurements, now and then commands by chance; one that never changes;
+        # frames without a byte.
+        others = [int(noise.integers(256)), 0x80, 0xA2]
+        mask = ours(decoder, [1, 2, 3, 0x101], [*others, ROUND[k % 44]], [8, 8, 0, 3])
+        assert mask == (None if k < 127 else [False, False, False, True])
+        assert decoder.senders == ([] if k < 127 else [0x101])
+    assert decoder.counters["other_ids"] == (400 - 127) * 3
+
+
+@pytest.mark.parametrize("later", [0, 1000])
+def test_two_identifiers_that_repeat_a_round_are_both_named(later: int) -> None:
+    decoder = CanSlotDecoder(fingers=1)
+    for k in range(later):
+        ours(decoder, [7], [ROUND[k % 44]])
+    for k in range(200):
+        ours(decoder, [7, 9], [ROUND[(later + k) % 44], ROUND[(k + 5) % 44]])
+    assert decoder.senders == [7, 9]
+
+
+def test_a_sender_that_loses_slots_is_found() -> None:
+    decoder = CanSlotDecoder(fingers=1)
+    for k in range(3000):
+        if k < 2000 and k % 100 == 0:
+            continue
+        ours(decoder, [7], [ROUND[k % 44]])
+    assert decoder.senders == [7]
 
 
 def test_fingers_in_range() -> None:
