@@ -11,6 +11,8 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from palpate.errors import DeviceError, DeviceTimeout
@@ -125,8 +127,8 @@ _SILENCE_S = 0.3
 """Silence that is taken as a restart; longer at low rates [s]."""
 
 _ZERO_SAMPLES = 5
-_NEAR_ZERO = 20.0
-"""Largest mean after a zero [counts]; the rest is noise."""
+_ROUNDING = 2.0
+"""Counts that a sensor without noise may still read after its zero."""
 
 
 class RobotousOptions(WrenchOptions):
@@ -221,16 +223,17 @@ class WrenchRobotous(WrenchDevice):
 
         The request has no answer, so the samples after it must show that it was taken.
         """
-        before = self._mean()
+        before, spread_before = self._load()
         for _ in range(_ATTEMPTS):
             self._line.send(wire.BIAS_REQUEST)
-            self._mean()  # some of these may have been on their way
-            after = self._mean()
-            pairs = zip(before, after, strict=True)
-            if all(abs(now) <= max(_NEAR_ZERO, 0.5 * abs(then)) for then, now in pairs):
+            self._load()  # some of these samples may have been on their way
+            after, spread = self._load()
+            noise = spread_before + spread + _ROUNDING
+            if np.all(abs(after) <= 0.5 * abs(before) + noise):
                 return
         raise DeviceError(
-            f"{self.info.model}: it took no zero: {tuple(map(round, after))} counts are left",
+            f"{self.info.model}: it took no zero: {after.round().astype(int).tolist()} counts "
+            "are left",
             remedy="leave the load unchanged while zero is taken",
         )
 
@@ -296,8 +299,8 @@ class WrenchRobotous(WrenchDevice):
         self._counts["other_answers"] += len(records) - len(samples)
         return samples
 
-    def _mean(self) -> list[float]:
-        """Mean counts of the next samples."""
+    def _load(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Mean and spread of the next samples [counts], shape ``(6,)`` each."""
         samples: list[RobotousData] = []
         until = time.monotonic() + self._silence_s + 2.0 * _ZERO_SAMPLES / self.info.rate_hz
         while len(samples) < _ZERO_SAMPLES:
@@ -305,7 +308,8 @@ class WrenchRobotous(WrenchDevice):
         self._arrivals.begin()
         if any(sample.overload for sample in samples):
             raise DeviceError(f"{self.info.model}: it is overloaded", remedy="take the load off")
-        return [sum(axis) / len(samples) for axis in zip(*(s.counts for s in samples), strict=True)]
+        counts = np.array([sample.counts for sample in samples], np.float64)
+        return counts.mean(axis=0), np.ptp(counts, axis=0)
 
     def _text(self, command: RobotousCommand) -> str:
         record = self._answer(wire.request(command), command)

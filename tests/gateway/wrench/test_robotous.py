@@ -140,10 +140,11 @@ def test_zero_is_taken_in_the_sensor(sensor: RobotousEmulator) -> None:
         assert all(not reading.force.any() for reading in follower.more(10))
 
 
+@pytest.mark.parametrize("load", [LOAD, (0.36, -0.3, 0.38, 0.009, 0.0, -0.0095)])
 def test_a_zero_that_is_not_taken_is_told(
-    sensor: RobotousEmulator, monkeypatch: pytest.MonkeyPatch
+    sensor: RobotousEmulator, load: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sensor._source = lambda _: LOAD
+    sensor._source = lambda _: load
     answer = sensor._answer
     monkeypatch.setattr(sensor, "_answer", lambda r: answer(r) if r[0] != 17 else None)
     with make(line_of(sensor)) as device, pytest.raises(DeviceError, match="it took no zero"):
