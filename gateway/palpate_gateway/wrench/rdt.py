@@ -218,6 +218,7 @@ class WrenchRdt(WrenchDevice):
         """Reset the state of an earlier connection."""
         self._decoder, self._sequence = RdtDecoder(), RdtSequence()
         self._early: list[_Record] = []
+        self._number = 0
         self._heard_s = time.monotonic()
 
     def zero(self) -> None:
@@ -265,12 +266,9 @@ class WrenchRdt(WrenchDevice):
                 self._port.write(wire.hex_filter_request(self._options.filter_code))
             self._port.write(wire.hex_period_request(self._options.period_ms))
         self._start()
-        several = self._is_hex and self._early[0].raw.status & _SEVERAL_SENSORS
-        if several and self._options.sensor is None:
-            raise DeviceError(
-                f"{self.info.model}: its converter has several sensors",
-                remedy="name one by the option 'sensor'",
-            )
+        first = self._early[0].raw.status
+        self._number = wire.hex_sensor_number(first)
+        self._is_chosen(first)
         return serial or self._port.name
 
     def _learn(self) -> str:
@@ -381,7 +379,7 @@ class WrenchRdt(WrenchDevice):
     def _overload(self, raw: RdtRecord) -> bool | None:
         """Whether the range is exceeded; None, and counted, if the record is not valid."""
         profile, status = self._profile, raw.status
-        if self._is_hex and self._options.sensor not in (None, wire.hex_sensor_number(status)):
+        if not self._is_chosen(status):
             self._counts["other_sensors"] += 1
             return None
         for name in profile.status_names(status):
@@ -395,6 +393,22 @@ class WrenchRdt(WrenchDevice):
             return overload
         self._counts["invalid_samples"] += 1
         return None
+
+    def _is_chosen(self, status: int) -> bool:
+        """Whether a record is of the sensor to be read.
+
+        Raises:
+            DeviceLost: None is named, and there are several, perhaps only since a moment ago.
+        """
+        if not self._is_hex:
+            return True
+        number, chosen = wire.hex_sensor_number(status), self._options.sensor
+        if chosen is None and (status & _SEVERAL_SENSORS or number != self._number):
+            raise DeviceLost(
+                f"{self.info.model}: its converter has several sensors",
+                remedy="name one by the option 'sensor'",
+            )
+        return chosen in (None, number)
 
     def _protocol_counters(self) -> Mapping[str, int]:
         counters = {**self._decoder.counters, **self._sequence.counters}

@@ -94,8 +94,12 @@ def test_a_drifting_clock_is_followed() -> None:
 class SeveralSensors(RdtEmulator):
     """A HEX converter whose records come from sensors 1 and 2 in turn."""
 
+    plugged = True
+
     def _record(self) -> bytes:
         whole = bytearray(super()._record())
+        if not self.plugged:
+            return bytes(whole)
         number = 1 + self._sequence % 2
         whole[11] |= 0b1000 | number
         return bytes(whole) if number == 1 else bytes(whole[:12]) + bytes(24)
@@ -108,6 +112,16 @@ def test_of_several_sensors_one_must_be_named() -> None:
         with device_at(emulator, "onrobot_hex", sensor=1) as device:
             fakes.read_until(device, lambda readings: len(readings) >= 20)
             assert device.counters["other_sensors"] >= 19
+
+
+def test_a_second_sensor_that_is_plugged_in_later_is_not_mixed_in() -> None:
+    with SeveralSensors("hex", fakes.wave) as emulator:
+        emulator.plugged = False
+        with device_at(emulator, "onrobot_hex") as device:
+            fakes.read_until(device, lambda readings: len(readings) >= 20)
+            emulator.plugged = True
+            with pytest.raises(DeviceLost, match="several sensors"):
+                fakes.read_until(device, lambda _: False)  # and none is of the other one
 
 
 def test_with_a_wrong_rate_it_is_opened_with_the_hosts_clock(
