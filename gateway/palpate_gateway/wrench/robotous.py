@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from palpate.errors import DeviceError, DeviceTimeout
+from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.clock.sample_times import ArrivalTimes
 from palpate_gateway.ports.can_bus import CanBus
 from palpate_gateway.ports.serial_port import SerialPort
@@ -126,6 +126,9 @@ _DRAIN_S = 0.3
 _SILENCE_S = 0.3
 """Silence that is taken as a restart; longer at low rates [s]."""
 
+_CROWDED = 1.3
+"""A sensor does not send so many times the samples that it was set to; two of them do."""
+
 _ZERO_SAMPLES = 5
 _ROUNDING = 2.0
 """Counts that a sensor without noise may still read after its zero."""
@@ -217,6 +220,7 @@ class WrenchRobotous(WrenchDevice):
         self._silence_s = max(_SILENCE_S, 5.0 / options.rate_hz)
         self._scale = wire.RobotousScale(1.0)
         self._arrivals = ArrivalTimes(1.0 / options.rate_hz)
+        self._crowded = False
 
     def zero(self) -> None:
         """See ``WrenchDevice``; what comes meanwhile is thrown away.
@@ -251,7 +255,13 @@ class WrenchRobotous(WrenchDevice):
         self._set(wire.filter_request(cutoff_hz, order=self._options.filter_order))
         self._set(wire.rate_request(self._options.rate_hz))
         self._answer(wire.START_REQUEST, RobotousCommand.START)
-        self._arrivals.begin()
+        self._arrivals = ArrivalTimes(1.0 / self.info.rate_hz)
+        if self._crowded:
+            until = time.monotonic() + self._arrivals.check_s
+            while time.monotonic() < until:
+                with contextlib.suppress(DeviceTimeout):
+                    self._receive(_QUIET_S)
+            self._crowded = False
         return serial or self._line.name
 
     def _scale_of(self, reported: str) -> wire.RobotousScale:
@@ -281,6 +291,13 @@ class WrenchRobotous(WrenchDevice):
 
     def _readings(self, samples: Sequence[RobotousData]) -> list[WrenchReading]:
         times_ns = self._arrivals.times_ns(len(samples), time.monotonic_ns())
+        if self._options.interface and self._arrivals.rate_hz > _CROWDED * self.info.rate_hz:
+            self._crowded = True
+            raise DeviceLost(
+                f"{self.info.model}: {self._arrivals.rate_hz:.0f} samples/s come, not "
+                f"{self.info.rate_hz:g}: more than one sensor has its CAN identifiers",
+                remedy="give each sensor on the bus its own CAN identifiers",
+            )
         readings = []
         for arrival_ns, sample in zip(times_ns, samples, strict=True):
             for axis in wire.overloaded_axes(sample.overload):
@@ -348,7 +365,7 @@ class WrenchRobotous(WrenchDevice):
         )
 
     def _protocol_counters(self) -> Mapping[str, int]:
-        return self._line.counters
+        return {**self._line.counters, **self._arrivals.counters}
 
 
 def _name(request: bytes) -> str:
