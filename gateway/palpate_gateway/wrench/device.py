@@ -32,6 +32,16 @@ _PROMPT_EACH_S = 0.1
 """Time between two samples that are read without gathering others [s]."""
 
 
+_GARBAGE = 1e9
+"""No sensor measures as much [N, N m]; with any arm it is still a number in float32."""
+
+
+def is_measured(wrench: Sequence[float]) -> bool:
+    """Whether a sensor can have measured these: numbers, and no garbage like 1e39."""
+    # False also of NaN.
+    return all(-_GARBAGE < value < _GARBAGE for value in wrench)
+
+
 class MountOptions(StrictConfig):
     """How a force/torque sensor is mounted.
 
@@ -251,7 +261,7 @@ class WrenchDevice(Device):
         tick: int | None = None,
         overload: bool = False,
     ) -> WrenchReading | None:
-        """A reading on the BioTac; None, and counted, if a value is not finite.
+        """A reading on the BioTac; None, and counted, if a value is not finite or garbage.
 
         Args:
             wrench: Fx Fy Fz [N] Tx Ty Tz [N m] in the force/torque sensor's frame.
@@ -260,7 +270,7 @@ class WrenchDevice(Device):
             tick: The device's unwrapped counter; None = use a count of our own.
             overload: Whether the range is exceeded.
         """
-        if not all(map(math.isfinite, wrench)):
+        if not is_measured(wrench):
             self._counts["not_finite"] += 1
             return None
         force, torque = self._mount.on_biotac(np.array(wrench, np.float64))
