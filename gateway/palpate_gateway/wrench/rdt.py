@@ -22,7 +22,11 @@ from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.ports.port import settle, silent
 from palpate_gateway.ports.sockets import ReceivedBytes, UdpPort, read_page
 from palpate_gateway.protocols import rdt as wire
-from palpate_gateway.protocols.netft_xml import DOCUMENT_BYTES_MAX, parse_netft_xml
+from palpate_gateway.protocols.netft_xml import (
+    DOCUMENT_BYTES_MAX,
+    NetftSettings,
+    parse_netft_xml,
+)
 from palpate_gateway.protocols.rdt import RdtDecoder, RdtRecord, RdtScale, RdtSequence, unwrap
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
@@ -180,7 +184,9 @@ _PATIENCE_S = 0.1
 _STARTS = 10
 _ZEROS = 3
 _ZERO_RECORDS = 5
-_PAGE_S = 3.0
+_PAGE_S, _PAGE_AGAIN_S = 3.0, 1.0
+"""Longest time to read the web page when it is opened, and between two records [s]."""
+
 _AT_ONCE = 256
 """Most datagrams in one answer of ``read``."""
 
@@ -219,6 +225,7 @@ class WrenchRdt(WrenchDevice):
         self._decoder, self._sequence = RdtDecoder(), RdtSequence()
         self._early: list[_Record] = []
         self._number = 0
+        self._interrupted = False
         self._heard_s = time.monotonic()
 
     def zero(self) -> None:
@@ -268,6 +275,7 @@ class WrenchRdt(WrenchDevice):
         self._start()
         first = self._early[0].raw.status
         self._number = wire.hex_sensor_number(first)
+        self._interrupted = False
         self._is_chosen(first)
         return serial or self._port.name
 
@@ -276,9 +284,7 @@ class WrenchRdt(WrenchDevice):
         options, profile, serial = self._options, self._profile, ""
         scale, counter_hz = options.scale() or profile.scale, profile.ft_rate_hz
         if scale is None:
-            url = f"http://{options.host}:{options.http_port}/netftapi2.xml"
-            page = read_page(url, timeout_s=_PAGE_S, most_bytes=DOCUMENT_BYTES_MAX)
-            settings = parse_netft_xml(page)
+            settings = self._page(_PAGE_S)
             scale, serial = settings.scale, settings.serial
             counter_hz = counter_hz or settings.sample_rate_hz
             sends_hz = settings.rdt_rate_hz or options.rate_hz
@@ -300,6 +306,30 @@ class WrenchRdt(WrenchDevice):
         self._has_clock = counter_hz is not None
         return serial
 
+    def _page(self, timeout_s: float) -> NetftSettings:
+        options = self._options
+        url = f"http://{options.host}:{options.http_port}/netftapi2.xml"
+        page = read_page(url, timeout_s=timeout_s, most_bytes=DOCUMENT_BYTES_MAX)
+        return parse_netft_xml(page)
+
+    def _check_scale(self) -> None:
+        """After an interruption: whoever caused it may have changed the device's settings."""
+        self._interrupted = False
+        if self._options.scale() or self._profile.scale:
+            return
+        try:
+            scale = self._page(_PAGE_AGAIN_S).scale
+        except DeviceError:
+            self._counts["page_unread"] += 1
+            return
+        if scale != self._scale:
+            raise DeviceLost(
+                f"{self.info.model}: its counts per N and per N m were "
+                f"{self._scale.counts_per_n:g} and {self._scale.counts_per_n_m:g}, and are "
+                f"{scale.counts_per_n:g} and {scale.counts_per_n_m:g}",
+                remedy="it is opened again with the new ones; take its zero again",
+            )
+
     def _start(self) -> None:
         for _ in range(_STARTS):
             self._port.write(wire.START_REQUEST)
@@ -320,7 +350,10 @@ class WrenchRdt(WrenchDevice):
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
         readings = []
-        for record in self._listen(timeout_s):
+        records = self._listen(timeout_s)
+        if self._interrupted:
+            self._check_scale()
+        for record in records:
             overload = self._overload(record.raw)
             if overload is None:
                 continue
@@ -369,6 +402,7 @@ class WrenchRdt(WrenchDevice):
         for raw in self._decoder.feed(datagram.data):
             self._heard_s = time.monotonic()
             step = self._sequence.step(raw.rdt_sequence, raw.ft_sequence)
+            self._interrupted |= step.new_epoch
             if step.keep:
                 time_s = self._clock.follow(
                     raw.ft_sequence, 1e-9 * datagram.arrival_ns, new_epoch=step.new_epoch

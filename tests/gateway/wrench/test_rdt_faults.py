@@ -15,7 +15,7 @@ from tests.gateway.reading_devices import open_again
 from palpate.config import parse_config
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.emulators.emulator import Wrench
-from palpate_gateway.emulators.rdt import RdtEmulator
+from palpate_gateway.emulators.rdt import RdtEmulator, page
 from palpate_gateway.wrench.rdt import RdtOptions, WrenchRdt
 
 fakes: Any = importlib.import_module("wrench_fakes")
@@ -89,6 +89,26 @@ def test_a_drifting_clock_is_followed() -> None:
         readings = fakes.read_until(device, lambda readings: len(readings) >= 500)
     times = np.array([r.time_s for r in readings])
     assert (times[-1] - times[0]) / (len(times) - 1) == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_a_scale_that_changed_while_the_stream_was_interrupted_is_noticed() -> None:
+    with running(source=fakes.constant) as (emulator, device):
+        fakes.take(device, 5)
+        emulator.inject("silence", 100.0)
+        while not device.counters.get("starts_repeated"):
+            fakes.wait_for_timeout(device)
+        fakes.end(emulator, "silence")
+        fakes.take(device, 50)  # the same as before
+        emulator.inject("silence", 100.0)
+        emulator.page.content = page("Net F/T", (1e4, 1e5), ("N", "Nm"))
+        emulator._counts_per_si = np.repeat((1e4, 1e5), 3)
+        fakes.wait_for_timeout(device)
+        fakes.end(emulator, "silence")
+        with pytest.raises(DeviceLost, match=r"were 1e\+06 and 1e\+06, and are 10000 and 100000"):
+            fakes.take(device, 10_000)
+        open_again(device)
+        for reading in fakes.take(device, 50):
+            assert reading.force == pytest.approx(fakes.CONSTANT[:3], abs=1e-3)
 
 
 class SeveralSensors(RdtEmulator):
