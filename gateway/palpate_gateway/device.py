@@ -177,6 +177,28 @@ class Device(ABC):
         self.close()
 
 
+def silence_of(
+    name: str, silent_s: float, counters: Mapping[str, int], before: Mapping[str, int], remedy: str
+) -> tuple[str, str]:
+    """Problem and remedy of a device that gave no reading.
+
+    Args:
+        name: What to call it.
+        silent_s: For how long [s].
+        counters: Its counters now.
+        before: Its counters when the silence began.
+        remedy: What to do where nothing was counted.
+    """
+    # Names only: numbers would make each of these errors another one in the log.
+    rose = sorted(key for key, count in counters.items() if count > before.get(key, 0))
+    if not rose:
+        return f"{name}: no reading came within {silent_s:.3g} s", remedy
+    return (
+        f"{name}: no reading came within {silent_s:.3g} s, but it counted {', '.join(rose)}",
+        "look these counters up on the device's page; then check its power and cable",
+    )
+
+
 class BusDevice(Device):
     """A device whose readings come over the bus, from another program.
 

@@ -201,7 +201,7 @@ class WrenchDevice(Device):
         )
 
     def _read(self, timeout_s: float) -> list[Reading]:
-        until = time.monotonic() + timeout_s
+        until, came = time.monotonic() + timeout_s, False
         if self._gather_s and time.monotonic() >= self._prompt_s:
             # The map of the device's clock needs samples that were read as soon as they came: if
             # all were read at regular times, their delay would hide in the clock for minutes.
@@ -211,15 +211,22 @@ class WrenchDevice(Device):
         while True:
             # Half a frame is not a reading, and an empty list would mean the end of the source.
             left_s = until - time.monotonic()
-            readings = self._receive(max(left_s, 0.0))
+            try:
+                readings = self._receive(max(left_s, 0.0))
+            except DeviceTimeout:
+                if not came:
+                    raise
+                readings, left_s = [], 0.0
             if readings:
                 self._counts["samples"] += len(readings)
                 return list(readings)
             if left_s <= 0.0:
                 raise DeviceTimeout(
-                    f"{self.info.model}: no whole reading within {timeout_s:g} s",
-                    remedy="bytes come, but no frame: check baud, model and wiring",
+                    f"{self.info.model}: something came, but no valid reading within "
+                    f"{timeout_s:.3g} s",
+                    remedy="its counters say what came; check baud, model and wiring",
                 )
+            came = True
 
     def _unless_silent(
         self, take: Callable[[float], Sequence[Sample]], timeout_s: float, silence_s: float

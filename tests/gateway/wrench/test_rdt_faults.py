@@ -14,6 +14,7 @@ from tests.gateway.reading_devices import open_again
 
 from palpate.config import parse_config
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
+from palpate.messages import ServiceState
 from palpate_gateway.emulators.emulator import Wrench
 from palpate_gateway.emulators.rdt import RdtEmulator, page
 from palpate_gateway.wrench.rdt import RdtOptions, WrenchRdt
@@ -81,6 +82,32 @@ def test_unplugged_it_is_found_and_opened_again() -> None:
         fakes.end(emulator, "unplug")
         open_again(device)
         fakes.read_until(device, lambda readings: len(readings) >= 50)
+
+
+def test_a_sensor_that_reports_itself_faulty_is_not_called_silent(bus: Any) -> None:
+    with RdtEmulator("netft", fakes.wave) as emulator:
+        host, _, port = emulator.address.partition(":")
+        options = {"product": "ati_net_ft", "host": host, "port": int(port)}
+        options["http_port"] = emulator.page.port
+        sensors = [{"name": "ft", "driver": "wrench_rdt", "options": options}]
+        with bus.gateway({"sensors": sensors}):
+            bus.state(ServiceState.READY)
+            emulator.inject("error", 100.0)
+
+            def told() -> str:
+                now = bus.status()
+                message = now.sensor_states[0].message if now else ""
+                return message if "no reading came" in message else ""
+
+            assert "but it counted" in (message := bus.until(told))
+            assert "invalid_samples" in message
+
+
+def test_what_comes_and_is_no_reading_is_not_nothing() -> None:
+    with running() as (emulator, device):
+        fakes.take(device, 5)
+        emulator.inject("error", 100.0)
+        assert "something came, but no valid reading within 0.1 s" in fakes.wait_for_timeout(device)
 
 
 def test_a_drifting_clock_is_followed() -> None:
