@@ -96,6 +96,9 @@ class Device(ABC):
     needs: ClassVar[tuple[str, ...]] = ()
     """Optional packages that it imports when it is opened; those of the extra ``gateway``."""
 
+    address = ""
+    """Where only one sensor can be, e.g. ``host:port``; empty = several may share it."""
+
     gone_s: ClassVar[float] = 2.0
     """A live device that has been silent for so long is closed and opened again [s]."""
 

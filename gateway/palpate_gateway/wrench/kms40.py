@@ -83,6 +83,7 @@ class WrenchKms40(WrenchDevice):
         self._filter, self._flags_every_s = options.filter_number, options.flags_every_s
         self._has_clock = False
         self._port = TcpPort(options.host, options.port)
+        self.address = self._port.name
         self._patience_s = max(_PATIENCE_S, 5.0 / rate_hz)
         self._begin()
 

@@ -215,6 +215,7 @@ class WrenchRdt(WrenchDevice):
         self._profile = wire.PROFILES[options.product]
         self._is_hex = self._profile is wire.HEX
         self._port = UdpPort(options.host, options.port)
+        self.address = self._port.name
         self._patience_s = max(_PATIENCE_S, 5.0 / options.rate_hz)
         self._scale = RdtScale(1.0, 1.0)
         self._clock = CounterClock(None, model)

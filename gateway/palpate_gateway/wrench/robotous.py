@@ -216,6 +216,7 @@ class WrenchRobotous(WrenchDevice):
         model = f"Robotous RFT on {self._line.name}"
         super().__init__("wrench_robotous", model, float(options.rate_hz), options)
         self._options = options
+        self.address = options.port or f"{self._line.name}, identifier {options.first_id}"
         self._has_clock = False
         self._silence_s = max(_SILENCE_S, 5.0 / options.rate_hz)
         self._scale = wire.RobotousScale(1.0)
