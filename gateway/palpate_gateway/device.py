@@ -96,6 +96,9 @@ class Device(ABC):
     needs: ClassVar[tuple[str, ...]] = ()
     """Optional packages that it imports when it is opened; those of the extra ``gateway``."""
 
+    address = ""
+    """Where only one sensor can be, e.g. ``host:port``; empty = several may share it."""
+
     gone_s: ClassVar[float] = 2.0
     """A live device that has been silent for so long is closed and opened again [s]."""
 
@@ -175,6 +178,28 @@ class Device(ABC):
 
     def __exit__(self, *exc_info: object) -> None:
         self.close()
+
+
+def silence_of(
+    name: str, silent_s: float, counters: Mapping[str, int], before: Mapping[str, int], remedy: str
+) -> tuple[str, str]:
+    """Problem and remedy of a device that gave no reading.
+
+    Args:
+        name: What to call it.
+        silent_s: For how long [s].
+        counters: Its counters now.
+        before: Its counters when the silence began.
+        remedy: What to do where nothing was counted.
+    """
+    # Names only: numbers would make each of these errors another one in the log.
+    rose = sorted(key for key, count in counters.items() if count > before.get(key, 0))
+    if not rose:
+        return f"{name}: no reading came within {silent_s:.3g} s", remedy
+    return (
+        f"{name}: no reading came within {silent_s:.3g} s, but it counted {', '.join(rose)}",
+        "look these counters up on the device's page; then check its power and cable",
+    )
 
 
 class BusDevice(Device):

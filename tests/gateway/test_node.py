@@ -205,6 +205,38 @@ def test_wrong_option_is_told_before_the_bus_is_joined() -> None:
         node.run(config, LinkConfig(), "lab", threading.Event())
 
 
+@pytest.mark.parametrize(
+    ("driver", "options", "other"),
+    [
+        ("wrench_rdt", {"product": "ati_axia"}, {"host": "192.168.1.2"}),
+        ("wrench_kms40", {"host": "a"}, {"host": "b"}),
+        ("wrench_bota", {"port": "/dev/a"}, {"port": "/dev/b"}),
+        ("wrench_robotous", {"port": "/dev/a"}, {"port": "/dev/b"}),
+        (
+            "wrench_robotous",
+            {"interface": "virtual", "channel": "a"},
+            {"first_id": 3, "second_id": 4},
+        ),
+    ],
+)
+def test_two_sensors_at_one_address_are_refused(
+    driver: str, options: dict[str, Any], other: dict[str, Any]
+) -> None:
+    def run(more: dict[str, Any]) -> None:
+        sensors = [
+            {"name": "a", "driver": driver, "options": options},
+            {"name": "b", "driver": driver, "options": options | more},
+        ]
+        config = parse_config(GatewayConfig, {"sensors": sensors}, where="test")
+        link = LinkConfig(connect=("tcp/127.0.0.1:9",), wait_for_router_s=0.0)
+        node.run(config, link, "lab", threading.Event())
+
+    with pytest.raises(ConfigError, match="sensors 'a' and 'b' are both at "):
+        run({})
+    with pytest.raises(LinkError):
+        run(other)
+
+
 def test_no_router() -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -85,6 +85,7 @@ def test_rejected_frames_are_counted_and_told_once(monkeypatch: pytest.MonkeyPat
     assert worker.crash is None
     assert len(sink.payloads) >= 10
     assert [error.reason for error in told] == ["serial"]  # type: ignore[attr-defined]
+    assert "sensor 'w': " in told[0].problem
     assert health.state is ServiceState.DEGRADED
     assert not worker.sound
     assert device.is_open is False

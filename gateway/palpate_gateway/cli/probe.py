@@ -60,8 +60,13 @@ def probe_command(driver: str, pairs: Sequence[str], *, seconds: float, as_json:
             streams = measure(device, seconds)
             found = _found(device, streams)
     except DeviceError as error:
+        counters = dict(device.counters)
         if as_json:
-            typer.echo(json.dumps({"error": error.problem, "fix": error.remedy}))
+            told = {"error": error.problem, "fix": error.remedy, "counters": counters}
+            typer.echo(json.dumps(told))
+        else:
+            for line in counter_lines(counters):
+                typer.echo(line)
         typer.echo(f"error: {error.problem}", err=True)
         typer.echo(f"  fix: {error.remedy}", err=True)
         return _FAILED

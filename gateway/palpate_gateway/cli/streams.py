@@ -12,7 +12,7 @@ import numpy as np
 
 from palpate.errors import DeviceTimeout
 from palpate.messages import FrameLayout
-from palpate_gateway.device import Device
+from palpate_gateway.device import Device, silence_of
 from palpate_gateway.readings import (
     ElectrodeReading,
     FieldReading,
@@ -216,8 +216,7 @@ def measure(device: Device, seconds: float) -> DeviceStreams:
             break
         streams.add(readings, time.monotonic())
     if not streams.by_name and silence is not None:
-        raise DeviceTimeout(
-            f"{device.info.model}: opened, but no reading came within {seconds:g} s",
-            remedy=silence.remedy,
-        ) from silence
+        name = f"{device.info.model}: opened"
+        problem, remedy = silence_of(name, seconds, device.counters, {}, silence.remedy)
+        raise DeviceTimeout(problem, remedy=remedy) from silence
     return streams

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import Enum
 
 _AWAKE_NS = 50_000_000
@@ -10,23 +11,47 @@ _AWAKE_NS = 50_000_000
 _CLUMP_NS = 10_000_000
 """Adapters deliver samples in clumps worth less than this [ns]."""
 
+_CHECK_NS = 2_000_000_000
+_CHECK_SAMPLES = 30
+"""The rate is measured over so long and so many samples, at least."""
+
+_TOLERANCE = 0.05
+"""Relative tolerance of the rate."""
+
 
 class ArrivalTimes:
     """Times of samples that carry none, from their arrival and the sensor's rate.
 
     A sample that is read at once was taken now. One that waited, because this process or its host
     stood still, must not look as fresh: buffers keep the oldest samples, so it follows the last
-    sample before the pause.
+    sample before the pause. A rate that is not the set one is measured, used and counted.
     """
 
     def __init__(self, period_s: float) -> None:
-        self._period_ns = round(1e9 * period_s)
-        self._read_ns: int | None = None
-        self._last_ns = 0
+        self.counters = {"rate_not_as_configured": 0}
+        """How often another rate was measured than the set one."""
+        self._set_ns = self._period_ns = round(1e9 * period_s)
+        self._check_ns = max(_CHECK_NS, _CHECK_SAMPLES * self._set_ns)
+        self._suspect_ns: float | None = None
+        self.begin()
 
     def begin(self) -> None:
         """The stream starts again: all earlier samples were read or discarded."""
-        self._read_ns = None
+        self._read_ns: int | None = None
+        self._last_ns = 0
+        self._behind = False
+        self._check_from_ns: int | None = None
+        self._came = 0
+
+    @property
+    def rate_hz(self) -> float:
+        """Rate at which samples come: the set one, until another one was measured."""
+        return 1e9 / self._period_ns
+
+    @property
+    def check_s(self) -> float:
+        """Time after which a wrong rate is known [s]."""
+        return 2.5e-9 * self._check_ns
 
     def times_ns(self, count: int, now_ns: int) -> list[int]:
         """Times of samples that were read together, by the host's monotonic clock [ns].
@@ -35,6 +60,7 @@ class ArrivalTimes:
             count: How many; at least one.
             now_ns: Host monotonic clock when they had been read [ns].
         """
+        self._check_rate(count, now_ns)
         step_ns, read_ns = self._period_ns, self._read_ns
         self._read_ns = now_ns
         waited = False
@@ -52,9 +78,30 @@ class ArrivalTimes:
     def _waited(self, worth_ns: int, since_ns: int) -> bool:
         """Whether samples worth ``worth_ns`` had waited, ``since_ns`` after the read before."""
         more_than_came = worth_ns > 1.25 * since_ns and worth_ns - since_ns > _CLUMP_NS
-        # The buffer overflowed: it holds the oldest samples.
+        # The buffer overflowed: it holds the oldest samples. That is over when it has been read; a
+        # sensor that is slower than it says looks like that every time, and must not fall behind.
         overflown = since_ns > _AWAKE_NS and _CLUMP_NS < worth_ns < 0.8 * since_ns
-        return more_than_came or overflown
+        waited = more_than_came or (overflown and not self._behind)
+        self._behind = waited and (overflown or self._behind)
+        return waited
+
+    def _check_rate(self, count: int, now_ns: int) -> None:
+        if self._check_from_ns is None:
+            self._check_from_ns = now_ns
+            return
+        self._came += count
+        waited_ns = now_ns - self._check_from_ns
+        if waited_ns < self._check_ns:
+            return
+        period_ns = waited_ns / self._came
+        self._check_from_ns, self._came = now_ns, 0
+        # A pause of this process looks like another rate, so one wrong measurement is not enough.
+        before_ns, self._suspect_ns = self._suspect_ns, period_ns
+        if math.isclose(period_ns, self._set_ns, rel_tol=_TOLERANCE):
+            self._suspect_ns, self._period_ns = None, self._set_ns
+        elif before_ns is not None and math.isclose(before_ns, period_ns, rel_tol=_TOLERANCE):
+            self._period_ns = round(period_ns)
+            self.counters["rate_not_as_configured"] += 1
 
 
 _BACKLOG_S = 2.0

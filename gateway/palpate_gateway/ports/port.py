@@ -65,7 +65,7 @@ class Port(ABC):
 def silent(name: str, timeout_s: float) -> DeviceTimeout:
     """The error of a port on which nothing came."""
     return DeviceTimeout(
-        f"{name}: nothing came within {timeout_s:g} s",
+        f"{name}: nothing came within {timeout_s:.3g} s",
         remedy="check power and cable; reading goes on by itself",
     )
 

@@ -14,7 +14,8 @@ import sys
 import time
 import urllib.request
 from abc import abstractmethod
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 from palpate.errors import DeviceError, DeviceLost
 from palpate_gateway.clock.wall_clock import KernelStamps
@@ -192,12 +193,43 @@ class UdpPort(_SocketPort):
         return link
 
 
+class _Deadline(socket.socket):
+    """A connection whose reads all end at one time: a timeout begins anew with every byte."""
+
+    until = 0.0
+
+    def recv_into(self, *args: Any, **kwargs: Any) -> int:
+        # Not 0: that would mean not to block.
+        self.settimeout(max(self.until - time.monotonic(), 1e-3))
+        return super().recv_into(*args, **kwargs)
+
+
+class _PageConnection(http.client.HTTPConnection):
+    def __init__(self, *args: Any, until: float, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._until = until
+
+    def connect(self) -> None:
+        super().connect()
+        self.sock = _Deadline(fileno=self.sock.detach())
+        self.sock.until = self._until
+
+
+class _PageHandler(urllib.request.HTTPHandler):
+    def __init__(self, until: float) -> None:
+        super().__init__()
+        self._until = until
+
+    def http_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
+        return self.do_open(partial(_PageConnection, until=self._until), req)
+
+
 def read_page(url: str, *, timeout_s: float, most_bytes: int) -> bytes:
     """The content of a page.
 
     Args:
         url: Its address.
-        timeout_s: Longest time until its header, and longest time for all of it [s].
+        timeout_s: Longest time to connect, and longest time for all of it [s].
         most_bytes: A longer page is refused.
 
     Raises:
@@ -205,11 +237,10 @@ def read_page(url: str, *, timeout_s: float, most_bytes: int) -> bytes:
     """
     until = time.monotonic() + timeout_s
     # No proxy: a sensor is in the local network.
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), _PageHandler(until))
     page = bytearray()
     try:
         with opener.open(url, timeout=timeout_s) as reply:
-            # Piece by piece: the socket's timeout starts again with every byte that arrives.
             while piece := reply.read1(_AT_ONCE):
                 page += piece
                 if len(page) > most_bytes:
@@ -217,12 +248,10 @@ def read_page(url: str, *, timeout_s: float, most_bytes: int) -> bytes:
                         f"{url}: more than {most_bytes} bytes",
                         remedy="this is no sensor's page; check the address",
                     )
-                if time.monotonic() > until:
-                    raise DeviceError(
-                        f"{url}: not read within {timeout_s:g} s", remedy=_PAGE_REMEDY
-                    )
     except DeviceError:
         raise
+    except TimeoutError as error:
+        raise DeviceError(f"{url}: not read within {timeout_s:g} s", remedy=_PAGE_REMEDY) from error
     except (OSError, ValueError, http.client.HTTPException) as error:
         raise DeviceError(f"{url}: {error}", remedy=_PAGE_REMEDY) from error
     return bytes(page)

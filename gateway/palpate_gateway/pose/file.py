@@ -18,7 +18,7 @@ from palpate.errors import RecordingError, WireError
 from palpate.files.record import RecordItem, only_name, read_record
 from palpate.messages import RobotPoseFrame
 from palpate_gateway.device import DeviceIdentity, FileDevice
-from palpate_gateway.pose.placement import Placement, PlacementOptions
+from palpate_gateway.pose.placement import Placement, PlacementOptions, within_reach
 from palpate_gateway.pose.table import PoseRow, PoseTable
 from palpate_gateway.pose.track import PoseTrack, PoseVerdict
 from palpate_gateway.readings import PoseReading
@@ -176,6 +176,13 @@ class PoseFile(FileDevice):
         for row in rows:
             if began_s is None:
                 began_s = row.time_s  # time zero: the wall clock is known at the first pose
+            if not within_reach(row.pose.position):  # in a record: a table tells line and column
+                told = ", ".join(f"{part:g}" for part in row.pose.position)
+                raise RecordingError(
+                    f"{self._options.path}: pose {row.tick} is at ({told}) m, out of any robot's "
+                    "reach",
+                    remedy="let the robot's program publish metres, and record again",
+                )
             self._samples += 1
             yield self._placement.reading(
                 row.pose,

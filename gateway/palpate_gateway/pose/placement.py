@@ -12,6 +12,7 @@ frame has its origin in the tip, and indents along its +z.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -22,10 +23,18 @@ from palpate.messages import Pose
 from palpate.rigid import compose, inverse, is_rotation, normalised, quaternion_length
 from palpate_gateway.readings import ClockObservation, PoseReading
 
+REACH_M = 100.0
+"""No robot reaches further from its base [m]: a larger coordinate is damage, or is in mm."""
+
 _NEEDED = {
     "indenter": ("base_sensor", "flange_indenter"),
     "biotac": ("flange_sensor", "base_indenter"),
 }
+
+
+def within_reach(position: Sequence[float]) -> bool:
+    """Whether a robot can be there; position [m], shape ``(3,)``."""
+    return all(abs(part) <= REACH_M for part in position)
 
 
 class PoseOptions(StrictConfig):
@@ -43,6 +52,10 @@ class PoseOptions(StrictConfig):
     def _is_pose(self) -> PoseOptions:
         if not all(map(math.isfinite, self.position_m)):
             raise ValueError(f"position_m {self.position_m} is not finite")
+        if not within_reach(self.position_m):
+            raise ValueError(
+                f"position_m {self.position_m} is out of any robot's reach: give metres, not mm"
+            )
         if not is_rotation(self.orientation_wxyz):
             raise ValueError(
                 f"orientation_wxyz {self.orientation_wxyz} has length "

@@ -13,7 +13,7 @@ from palpate.config import LinkConfig, Name, RouterOptions
 from palpate.errors import DeviceLost, DeviceTimeout, LinkError, StreamTimeout
 from palpate.messages import Origin, RobotPoseFrame
 from palpate_gateway.device import BusDevice, DeviceIdentity, DeviceInfo
-from palpate_gateway.pose.placement import Placement, PlacementOptions
+from palpate_gateway.pose.placement import Placement, PlacementOptions, within_reach
 from palpate_gateway.pose.track import PoseTrack, PoseVerdict
 from palpate_gateway.readings import ClockObservation, PoseReading, Reading
 
@@ -137,6 +137,13 @@ class PoseZenoh(BusDevice):
             # Its clock may have restarted, too, so the map of the clock must start again.
             self._restarted = verdict is PoseVerdict.RESTARTED
             return None
+        position = frame.pose_base_flange.position
+        if not within_reach(position):
+            told = ", ".join(f"{part:g}" for part in position)
+            raise DeviceLost(
+                f"robot {self._options.robot!r} is at ({told}) m, out of any robot's reach",
+                remedy="let its program publish metres: is this in mm?",
+            )
         if self._began_ns is None:
             self._began_ns = frame.time_ns
         # Relative to the first pose: a clock that counts from 1970 would lose digits.

@@ -16,12 +16,10 @@ from typing import IO
 from palpate.errors import RecordingError
 from palpate.messages import Pose
 from palpate.rigid import is_rotation, quaternion_length
+from palpate_gateway.pose.placement import REACH_M
 
 _LINE_LIMIT = 1 << 16
 """A longer line is not a line of such a file [bytes]."""
-
-_FAR = 1e6
-"""Largest valid coordinate, in m or in mm; a larger number is damage."""
 
 _WALL_DIGITS = 19
 _TIME, _WALL = "time_s", "wall_ns"
@@ -141,7 +139,8 @@ class PoseTable:
         if len(cells) != self._width:
             raise self._wrong(f"{len(cells)} columns, the header has {self._width}")
         time_s = self._value(cells, self._time, _TIME)
-        x, y, z = (self._scale * self._value(cells, *column, _FAR) for column in self._position)
+        most = REACH_M / self._scale
+        x, y, z = (self._scale * self._value(cells, *column, most) for column in self._position)
         w, qx, qy, qz = (self._value(cells, *column) for column in self._quaternion)
         if not is_rotation((w, qx, qy, qz)):
             raise self._wrong(
@@ -165,7 +164,10 @@ class PoseTable:
         if not math.isfinite(value):
             raise self._wrong(f"column {name!r}: {cells[at][:40]!r} is not finite")
         if abs(value) > most:
-            raise self._wrong(f"column {name!r}: {cells[at][:40]!r} is out of any robot's reach")
+            raise self._wrong(
+                f"column {name!r}: {cells[at][:40]!r} is out of any robot's reach",
+                "repair or delete the line; positions in mm have the columns x_mm y_mm z_mm",
+            )
         return value
 
     def _cells(self) -> list[str] | None:
@@ -209,6 +211,7 @@ class PoseTable:
 
 def _number(text: str) -> float | None:
     try:
-        return float(text)
+        # Python also reads 1_000 and the digits of all scripts.
+        return float(text) if text.isascii() and "_" not in text else None
     except ValueError:
         return None

@@ -55,19 +55,13 @@ def _is_good(frame: bytes) -> bool:
 
 
 class BotaDecoder(FrameFinder[BotaFrame]):
-    """Frames out of a serial line; the text before them counts as junk.
-
-    ``counters["not_finite"]`` counts good frames with a value that is no number; they are returned.
-    """
+    """Frames out of a serial line; the text before them counts as junk."""
 
     def __init__(self) -> None:
         super().__init__({_HEAD: FRAME_BYTES}, _is_good, self._frame)
-        self.counters["not_finite"] = 0
 
     def _frame(self, frame: bytes) -> BotaFrame:
         status, *wrench, time_us, temperature_c = _FIELDS.unpack_from(frame, 1)
-        finite = all(map(math.isfinite, (*wrench, temperature_c)))
-        self.counters["not_finite"] += not finite
         return BotaFrame(status, tuple(wrench), time_us, temperature_c)
 
 

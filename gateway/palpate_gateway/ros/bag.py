@@ -23,7 +23,7 @@ from palpate_gateway.protocols.ros_hands import RosFinger, RosHand, decode_hand
 from palpate_gateway.readings import ElectrodeReading, WrenchReading
 from palpate_gateway.ros.biotac import RosFingerOptions
 from palpate_gateway.ros.wrench import RosWrenchMessage, decode_wrench
-from palpate_gateway.wrench.device import Mount, MountOptions
+from palpate_gateway.wrench.device import Mount, MountOptions, is_measured
 
 _TACTILE = (BIOTAC_ALL, BIOTAC_HAND)
 
@@ -331,8 +331,7 @@ class RosBag(FileDevice):
         serial = self._options.wrench_serial or topic.strip("/").replace("/", "-")
         last_ns = -1
         for message, time_ns, _ in _onward(self._stamped(bag, topic), self._counts):
-            values = np.array(message.values)
-            if not np.isfinite(values).all():
+            if not is_measured(message.values):
                 self._counts["not_finite"] += 1
                 continue
             if time_ns <= last_ns:
@@ -340,7 +339,7 @@ class RosBag(FileDevice):
                 self._counts[late] += 1
                 continue
             last_ns = time_ns
-            force, torque = self._mount.on_biotac(values)
+            force, torque = self._mount.on_biotac(np.array(message.values))
             self._counts["wrenches"] += 1
             yield WrenchReading(
                 tick=self._counts["wrenches"],

@@ -119,6 +119,11 @@ class RosSubscription(Generic[T]):
         overflow = self._overflow if subscriber is None else subscriber.counters.get("overflow", 0)
         return {**self._counts, "queue_overflow": overflow}
 
+    @property
+    def publisher(self) -> bytes | None:
+        """Id of the publisher that is followed; None = its messages give none."""
+        return self._gid
+
     def open(self) -> RosMessage[T]:
         """Subscribe, and wait for the first message that can be decoded.
 

@@ -66,7 +66,7 @@ class RosWrench(WrenchDevice, RosDevice):
     """A force/torque sensor behind a topic.
 
     ROS has no common way to take its zero in the device, so this driver subtracts it: the zero is
-    lost with the gateway, and the sensor's range is not used better.
+    lost with the gateway, and with the publisher, and the sensor's range is not used better.
     """
 
     options_class = RosWrenchOptions
@@ -79,6 +79,8 @@ class RosWrench(WrenchDevice, RosDevice):
             options, WRENCH_STAMPED, decode_wrench
         )
         self._offset = np.zeros(6)
+        self._zeroed: bytes | None = None
+        self._same_publisher = False
         self._begin()
         self.join(LinkConfig(), "lab")
 
@@ -102,14 +104,19 @@ class RosWrench(WrenchDevice, RosDevice):
                 f"{self.info.model}: it sends numbers that are not finite",
                 remedy="check its driver: ros2 topic echo",
             )
-        self._offset = mean
+        self._offset, self._zeroed = mean, self._topic.publisher
 
     def _keeps_zero(self) -> bool:
-        return True
+        return self._same_publisher
 
     def _connect(self) -> str:
         self._begin()
         self._early = self._topic.open()
+        # A driver of ROS that was started again may have taken a zero of its own.
+        publisher = self._topic.publisher
+        self._same_publisher = publisher is not None and publisher == self._zeroed
+        if not self._same_publisher:
+            self._offset = np.zeros(6)
         return self._options.topic.strip("/").replace("/", "-")
 
     def _close(self) -> None:

@@ -64,7 +64,7 @@ def run(
         LinkError: The bus cannot be joined.
         RecordingError: With ``exit_at_end``, a recording was damaged; all before it was published.
     """
-    devices = [_device(sensor) for sensor in config.sensors]
+    devices = _devices(config)
     for device in devices:
         if isinstance(device, BusDevice):
             device.join(link, station)
@@ -127,6 +127,22 @@ def run(
                 for worker in workers:
                     worker.join(max(deadline_s - time.monotonic(), 0.0))
                 refresh()
+
+
+def _devices(config: GatewayConfig) -> list[Device]:
+    devices: list[Device] = []
+    at: dict[tuple[str, str], str] = {}
+    for sensor in config.sensors:
+        device = _device(sensor)
+        devices.append(device)
+        # Otherwise each would take the stream away from the other, for ever.
+        other = at.setdefault((sensor.driver, device.address or sensor.name), sensor.name)
+        if other != sensor.name:
+            raise ConfigError(
+                f"sensors {other!r} and {sensor.name!r} are both at {device.address}",
+                remedy="give each its own address; if they are one sensor, leave one of them out",
+            )
+    return devices
 
 
 def _device(sensor: SensorConfig) -> Device:

@@ -137,5 +137,9 @@ class MessagePublisher:
             frame = about(self._name, getattr(message, "stamp", None))
             _log.error("sensor %s: not published: %s", self._name, error, extra=frame)
             self._health.fail(
-                WireError(error.problem, remedy=_ENCODERS_DECIDE, reason=error.reason)
+                WireError(
+                    f"sensor {self._name!r}: {error.problem}",
+                    remedy=_ENCODERS_DECIDE,
+                    reason=error.reason,
+                )
             )

@@ -35,7 +35,7 @@ from palpate_gateway.clock.stamps import (
     PacedStart,
 )
 from palpate_gateway.clock.wall_clock import WallClock
-from palpate_gateway.device import Device
+from palpate_gateway.device import Device, silence_of
 from palpate_gateway.readings import Reading
 from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.service.publication import LATE_S, MessagePublisher
@@ -319,18 +319,25 @@ class SensorWorker:
         info = self.device.info
         read_s = _SILENT_READ_S if info.live else _READ_S
         silence = SilenceTimer(max(LOST_S, 3.0 / info.rate_hz) if info.live else inf, read_s)
+        before: dict[str, int] = {}
         turn_s = _TURN_S + self._key.patience_s if info.live else LATE_S
         while not self._stop.is_set():
             self._turns.next(turn_s)
             try:
                 readings = self._read(min(silence.begin(), _READ_S))
             except DeviceTimeout as error:
+                if not silence.silent_s:
+                    before = dict(self.device.counters)
                 silence.timed_out()
                 if info.live and silence.silent_s >= self.device.gone_s:
-                    raise DeviceLost(
-                        f"sensor {self.name!r} has been silent for {silence.silent_s:.1f} s",
-                        remedy="check its power and cable; it is opened again by itself",
-                    ) from error
+                    problem, remedy = silence_of(
+                        f"sensor {self.name!r}",
+                        self.device.gone_s,
+                        self.device.counters,
+                        before,
+                        "check its power and cable; it is opened again by itself",
+                    )
+                    raise DeviceLost(problem, remedy=remedy) from error
                 if silence.lost and self.serving and not self.silent:
                     self.silent = True
                     self._counters["silences"] += 1

@@ -97,6 +97,7 @@ class WrenchBota(WrenchDevice):
         super().__init__("wrench_bota", f"Bota on {options.port}", 1.0 / period_s, options)
         self._options = options
         self._period_us = 1e6 * period_s
+        self.address = options.port
         self._baud = options.baud  # 0 while it is not known
         self._port = SerialPort(options.port, options.baud or wire.BAUDS_TO_PROBE[0])
         self._begin()

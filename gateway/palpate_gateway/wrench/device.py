@@ -32,6 +32,16 @@ _PROMPT_EACH_S = 0.1
 """Time between two samples that are read without gathering others [s]."""
 
 
+_GARBAGE = 1e9
+"""No sensor measures as much [N, N m]; with any arm it is still a number in float32."""
+
+
+def is_measured(wrench: Sequence[float]) -> bool:
+    """Whether a sensor can have measured these: numbers, and no garbage like 1e39."""
+    # False also of NaN.
+    return all(-_GARBAGE < value < _GARBAGE for value in wrench)
+
+
 class MountOptions(StrictConfig):
     """How a force/torque sensor is mounted.
 
@@ -191,7 +201,7 @@ class WrenchDevice(Device):
         )
 
     def _read(self, timeout_s: float) -> list[Reading]:
-        until = time.monotonic() + timeout_s
+        until, came = time.monotonic() + timeout_s, False
         if self._gather_s and time.monotonic() >= self._prompt_s:
             # The map of the device's clock needs samples that were read as soon as they came: if
             # all were read at regular times, their delay would hide in the clock for minutes.
@@ -201,15 +211,22 @@ class WrenchDevice(Device):
         while True:
             # Half a frame is not a reading, and an empty list would mean the end of the source.
             left_s = until - time.monotonic()
-            readings = self._receive(max(left_s, 0.0))
+            try:
+                readings = self._receive(max(left_s, 0.0))
+            except DeviceTimeout:
+                if not came:
+                    raise
+                readings, left_s = [], 0.0
             if readings:
                 self._counts["samples"] += len(readings)
                 return list(readings)
             if left_s <= 0.0:
                 raise DeviceTimeout(
-                    f"{self.info.model}: no whole reading within {timeout_s:g} s",
-                    remedy="bytes come, but no frame: check baud, model and wiring",
+                    f"{self.info.model}: something came, but no valid reading within "
+                    f"{timeout_s:.3g} s",
+                    remedy="its counters say what came; check baud, model and wiring",
                 )
+            came = True
 
     def _unless_silent(
         self, take: Callable[[float], Sequence[Sample]], timeout_s: float, silence_s: float
@@ -251,7 +268,7 @@ class WrenchDevice(Device):
         tick: int | None = None,
         overload: bool = False,
     ) -> WrenchReading | None:
-        """A reading on the BioTac; None, and counted, if a value is not finite.
+        """A reading on the BioTac; None, and counted, if a value is not finite or garbage.
 
         Args:
             wrench: Fx Fy Fz [N] Tx Ty Tz [N m] in the force/torque sensor's frame.
@@ -260,7 +277,7 @@ class WrenchDevice(Device):
             tick: The device's unwrapped counter; None = use a count of our own.
             overload: Whether the range is exceeded.
         """
-        if not all(map(math.isfinite, wrench)):
+        if not is_measured(wrench):
             self._counts["not_finite"] += 1
             return None
         force, torque = self._mount.on_biotac(np.array(wrench, np.float64))

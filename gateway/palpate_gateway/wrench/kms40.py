@@ -83,8 +83,8 @@ class WrenchKms40(WrenchDevice):
         self._filter, self._flags_every_s = options.filter_number, options.flags_every_s
         self._has_clock = False
         self._port = TcpPort(options.host, options.port)
+        self.address = self._port.name
         self._patience_s = max(_PATIENCE_S, 5.0 / rate_hz)
-        self._arrivals = ArrivalTimes(1.0 / rate_hz)
         self._begin()
 
     def _begin(self) -> None:
@@ -96,7 +96,7 @@ class WrenchKms40(WrenchDevice):
         self._flags_due_s = 0.0
         self._flags_asked = False
         self._heard_s = time.monotonic()
-        self._arrivals.begin()
+        self._arrivals = ArrivalTimes(1.0 / self.info.rate_hz)
 
     def zero(self) -> None:
         """See ``WrenchDevice``; the stream pauses, and the samples before it are discarded."""
@@ -271,4 +271,4 @@ class WrenchKms40(WrenchDevice):
         return value
 
     def _protocol_counters(self) -> Mapping[str, int]:
-        return self._decoder.counters
+        return {**self._decoder.counters, **self._arrivals.counters}

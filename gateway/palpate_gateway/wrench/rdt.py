@@ -22,7 +22,11 @@ from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.ports.port import settle, silent
 from palpate_gateway.ports.sockets import ReceivedBytes, UdpPort, read_page
 from palpate_gateway.protocols import rdt as wire
-from palpate_gateway.protocols.netft_xml import DOCUMENT_BYTES_MAX, parse_netft_xml
+from palpate_gateway.protocols.netft_xml import (
+    DOCUMENT_BYTES_MAX,
+    NetftSettings,
+    parse_netft_xml,
+)
 from palpate_gateway.protocols.rdt import RdtDecoder, RdtRecord, RdtScale, RdtSequence, unwrap
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
@@ -180,7 +184,9 @@ _PATIENCE_S = 0.1
 _STARTS = 10
 _ZEROS = 3
 _ZERO_RECORDS = 5
-_PAGE_S = 3.0
+_PAGE_S, _PAGE_AGAIN_S = 3.0, 1.0
+"""Longest time to read the web page when it is opened, and between two records [s]."""
+
 _AT_ONCE = 256
 """Most datagrams in one answer of ``read``."""
 
@@ -209,6 +215,7 @@ class WrenchRdt(WrenchDevice):
         self._profile = wire.PROFILES[options.product]
         self._is_hex = self._profile is wire.HEX
         self._port = UdpPort(options.host, options.port)
+        self.address = self._port.name
         self._patience_s = max(_PATIENCE_S, 5.0 / options.rate_hz)
         self._scale = RdtScale(1.0, 1.0)
         self._clock = CounterClock(None, model)
@@ -218,6 +225,8 @@ class WrenchRdt(WrenchDevice):
         """Reset the state of an earlier connection."""
         self._decoder, self._sequence = RdtDecoder(), RdtSequence()
         self._early: list[_Record] = []
+        self._number = 0
+        self._interrupted = False
         self._heard_s = time.monotonic()
 
     def zero(self) -> None:
@@ -265,12 +274,10 @@ class WrenchRdt(WrenchDevice):
                 self._port.write(wire.hex_filter_request(self._options.filter_code))
             self._port.write(wire.hex_period_request(self._options.period_ms))
         self._start()
-        several = self._is_hex and self._early[0].raw.status & _SEVERAL_SENSORS
-        if several and self._options.sensor is None:
-            raise DeviceError(
-                f"{self.info.model}: its converter has several sensors",
-                remedy="name one by the option 'sensor'",
-            )
+        first = self._early[0].raw.status
+        self._number = wire.hex_sensor_number(first)
+        self._interrupted = False
+        self._is_chosen(first)
         return serial or self._port.name
 
     def _learn(self) -> str:
@@ -278,9 +285,7 @@ class WrenchRdt(WrenchDevice):
         options, profile, serial = self._options, self._profile, ""
         scale, counter_hz = options.scale() or profile.scale, profile.ft_rate_hz
         if scale is None:
-            url = f"http://{options.host}:{options.http_port}/netftapi2.xml"
-            page = read_page(url, timeout_s=_PAGE_S, most_bytes=DOCUMENT_BYTES_MAX)
-            settings = parse_netft_xml(page)
+            settings = self._page(_PAGE_S)
             scale, serial = settings.scale, settings.serial
             counter_hz = counter_hz or settings.sample_rate_hz
             sends_hz = settings.rdt_rate_hz or options.rate_hz
@@ -302,6 +307,30 @@ class WrenchRdt(WrenchDevice):
         self._has_clock = counter_hz is not None
         return serial
 
+    def _page(self, timeout_s: float) -> NetftSettings:
+        options = self._options
+        url = f"http://{options.host}:{options.http_port}/netftapi2.xml"
+        page = read_page(url, timeout_s=timeout_s, most_bytes=DOCUMENT_BYTES_MAX)
+        return parse_netft_xml(page)
+
+    def _check_scale(self) -> None:
+        """After an interruption: whoever caused it may have changed the device's settings."""
+        self._interrupted = False
+        if self._options.scale() or self._profile.scale:
+            return
+        try:
+            scale = self._page(_PAGE_AGAIN_S).scale
+        except DeviceError:
+            self._counts["page_unread"] += 1
+            return
+        if scale != self._scale:
+            raise DeviceLost(
+                f"{self.info.model}: its counts per N and per N m were "
+                f"{self._scale.counts_per_n:g} and {self._scale.counts_per_n_m:g}, and are "
+                f"{scale.counts_per_n:g} and {scale.counts_per_n_m:g}",
+                remedy="it is opened again with the new ones; take its zero again",
+            )
+
     def _start(self) -> None:
         for _ in range(_STARTS):
             self._port.write(wire.START_REQUEST)
@@ -322,7 +351,10 @@ class WrenchRdt(WrenchDevice):
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
         readings = []
-        for record in self._listen(timeout_s):
+        records = self._listen(timeout_s)
+        if self._interrupted:
+            self._check_scale()
+        for record in records:
             overload = self._overload(record.raw)
             if overload is None:
                 continue
@@ -371,6 +403,7 @@ class WrenchRdt(WrenchDevice):
         for raw in self._decoder.feed(datagram.data):
             self._heard_s = time.monotonic()
             step = self._sequence.step(raw.rdt_sequence, raw.ft_sequence)
+            self._interrupted |= step.new_epoch
             if step.keep:
                 time_s = self._clock.follow(
                     raw.ft_sequence, 1e-9 * datagram.arrival_ns, new_epoch=step.new_epoch
@@ -381,7 +414,7 @@ class WrenchRdt(WrenchDevice):
     def _overload(self, raw: RdtRecord) -> bool | None:
         """Whether the range is exceeded; None, and counted, if the record is not valid."""
         profile, status = self._profile, raw.status
-        if self._is_hex and self._options.sensor not in (None, wire.hex_sensor_number(status)):
+        if not self._is_chosen(status):
             self._counts["other_sensors"] += 1
             return None
         for name in profile.status_names(status):
@@ -395,6 +428,22 @@ class WrenchRdt(WrenchDevice):
             return overload
         self._counts["invalid_samples"] += 1
         return None
+
+    def _is_chosen(self, status: int) -> bool:
+        """Whether a record is of the sensor to be read.
+
+        Raises:
+            DeviceLost: None is named, and there are several, perhaps only since a moment ago.
+        """
+        if not self._is_hex:
+            return True
+        number, chosen = wire.hex_sensor_number(status), self._options.sensor
+        if chosen is None and (status & _SEVERAL_SENSORS or number != self._number):
+            raise DeviceLost(
+                f"{self.info.model}: its converter has several sensors",
+                remedy="name one by the option 'sensor'",
+            )
+        return chosen in (None, number)
 
     def _protocol_counters(self) -> Mapping[str, int]:
         counters = {**self._decoder.counters, **self._sequence.counters}

@@ -11,9 +11,11 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from palpate.errors import DeviceError, DeviceTimeout
+from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.clock.sample_times import ArrivalTimes
 from palpate_gateway.ports.can_bus import CanBus
 from palpate_gateway.ports.serial_port import SerialPort
@@ -124,9 +126,12 @@ _DRAIN_S = 0.3
 _SILENCE_S = 0.3
 """Silence that is taken as a restart; longer at low rates [s]."""
 
+_CROWDED = 1.3
+"""A sensor does not send so many times the samples that it was set to; two of them do."""
+
 _ZERO_SAMPLES = 5
-_NEAR_ZERO = 20.0
-"""Largest mean after a zero [counts]; the rest is noise."""
+_ROUNDING = 2.0
+"""Counts that a sensor without noise may still read after its zero."""
 
 
 class RobotousOptions(WrenchOptions):
@@ -211,26 +216,29 @@ class WrenchRobotous(WrenchDevice):
         model = f"Robotous RFT on {self._line.name}"
         super().__init__("wrench_robotous", model, float(options.rate_hz), options)
         self._options = options
+        self.address = options.port or f"{self._line.name}, identifier {options.first_id}"
         self._has_clock = False
         self._silence_s = max(_SILENCE_S, 5.0 / options.rate_hz)
         self._scale = wire.RobotousScale(1.0)
         self._arrivals = ArrivalTimes(1.0 / options.rate_hz)
+        self._crowded = False
 
     def zero(self) -> None:
         """See ``WrenchDevice``; what comes meanwhile is thrown away.
 
         The request has no answer, so the samples after it must show that it was taken.
         """
-        before = self._mean()
+        before, spread_before = self._load()
         for _ in range(_ATTEMPTS):
             self._line.send(wire.BIAS_REQUEST)
-            self._mean()  # some of these may have been on their way
-            after = self._mean()
-            pairs = zip(before, after, strict=True)
-            if all(abs(now) <= max(_NEAR_ZERO, 0.5 * abs(then)) for then, now in pairs):
+            self._load()  # some of these samples may have been on their way
+            after, spread = self._load()
+            noise = spread_before + spread + _ROUNDING
+            if np.all(abs(after) <= 0.5 * abs(before) + noise):
                 return
         raise DeviceError(
-            f"{self.info.model}: it took no zero: {tuple(map(round, after))} counts are left",
+            f"{self.info.model}: it took no zero: {after.round().astype(int).tolist()} counts "
+            "are left",
             remedy="leave the load unchanged while zero is taken",
         )
 
@@ -248,7 +256,13 @@ class WrenchRobotous(WrenchDevice):
         self._set(wire.filter_request(cutoff_hz, order=self._options.filter_order))
         self._set(wire.rate_request(self._options.rate_hz))
         self._answer(wire.START_REQUEST, RobotousCommand.START)
-        self._arrivals.begin()
+        self._arrivals = ArrivalTimes(1.0 / self.info.rate_hz)
+        if self._crowded:
+            until = time.monotonic() + self._arrivals.check_s
+            while time.monotonic() < until:
+                with contextlib.suppress(DeviceTimeout):
+                    self._receive(_QUIET_S)
+            self._crowded = False
         return serial or self._line.name
 
     def _scale_of(self, reported: str) -> wire.RobotousScale:
@@ -278,6 +292,13 @@ class WrenchRobotous(WrenchDevice):
 
     def _readings(self, samples: Sequence[RobotousData]) -> list[WrenchReading]:
         times_ns = self._arrivals.times_ns(len(samples), time.monotonic_ns())
+        if self._options.interface and self._arrivals.rate_hz > _CROWDED * self.info.rate_hz:
+            self._crowded = True
+            raise DeviceLost(
+                f"{self.info.model}: {self._arrivals.rate_hz:.0f} samples/s come, not "
+                f"{self.info.rate_hz:g}: more than one sensor has its CAN identifiers",
+                remedy="give each sensor on the bus its own CAN identifiers",
+            )
         readings = []
         for arrival_ns, sample in zip(times_ns, samples, strict=True):
             for axis in wire.overloaded_axes(sample.overload):
@@ -296,8 +317,8 @@ class WrenchRobotous(WrenchDevice):
         self._counts["other_answers"] += len(records) - len(samples)
         return samples
 
-    def _mean(self) -> list[float]:
-        """Mean counts of the next samples."""
+    def _load(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Mean and spread of the next samples [counts], shape ``(6,)`` each."""
         samples: list[RobotousData] = []
         until = time.monotonic() + self._silence_s + 2.0 * _ZERO_SAMPLES / self.info.rate_hz
         while len(samples) < _ZERO_SAMPLES:
@@ -305,7 +326,8 @@ class WrenchRobotous(WrenchDevice):
         self._arrivals.begin()
         if any(sample.overload for sample in samples):
             raise DeviceError(f"{self.info.model}: it is overloaded", remedy="take the load off")
-        return [sum(axis) / len(samples) for axis in zip(*(s.counts for s in samples), strict=True)]
+        counts = np.array([sample.counts for sample in samples], np.float64)
+        return counts.mean(axis=0), np.ptp(counts, axis=0)
 
     def _text(self, command: RobotousCommand) -> str:
         record = self._answer(wire.request(command), command)
@@ -344,7 +366,7 @@ class WrenchRobotous(WrenchDevice):
         )
 
     def _protocol_counters(self) -> Mapping[str, int]:
-        return self._line.counters
+        return {**self._line.counters, **self._arrivals.counters}
 
 
 def _name(request: bytes) -> str:

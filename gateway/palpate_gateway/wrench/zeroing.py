@@ -20,6 +20,9 @@ _MEAN_S = 0.5
 ZERO_LEAST = 5
 """Readings in each mean, at least."""
 
+_SMALL = 0.1
+"""Share of the limits of the standard deviation that a load without noise may be off zero."""
+
 _Wrenches = npt.NDArray[np.float64]
 
 
@@ -30,6 +33,8 @@ class _ZeroRequest:
         self.count = count
         self.future: Future[WrenchZero] = Future()
         self.before: _Wrenches | None = None
+        self.noise: _Wrenches = np.zeros(6)
+        self.zero_lost = False
         self.taken_ns = (0, 0)
         self.readings: list[WrenchReading] = []
 
@@ -98,11 +103,13 @@ class Zeroing:
         wrenches = np.array([(*one.force, *one.torque) for one in request.readings], np.float64)
         if request.before is None:
             self._check_still(wrenches, request.readings)
-            request.before = wrenches.mean(axis=0)
+            request.before, request.noise = wrenches.mean(axis=0), wrenches.std(axis=0)
             request.readings = []
+            request.zero_lost = self._device.zero_lost
             self._device.take_zero()
             request.taken_ns = time.monotonic_ns(), time.time_ns()
             return
+        self._check_changed(request, wrenches)
         self._done(request)
         if request.future.set_running_or_notify_cancel():
             before, after = (
@@ -140,6 +147,20 @@ class Zeroing:
                     f"{len(wrenches)} readings, at most {most:g} are allowed",
                     remedy="leave the sensor and the BioTac untouched, and try again",
                 )
+
+    def _check_changed(self, request: _ZeroRequest, wrenches: _Wrenches) -> None:
+        """A device may say that it took a zero, and go on as before."""
+        assert request.before is not None
+        limits = self._device.zero_limits
+        rest = np.repeat((limits.zero_max_sd_n, limits.zero_max_sd_nm), 3) * _SMALL
+        noise = request.noise + wrenches.std(axis=0) + rest
+        unchanged = np.abs(wrenches.mean(axis=0) - request.before) <= noise
+        if unchanged.all() and (np.abs(request.before) > 2.0 * noise).any():
+            self._device.zero_lost = request.zero_lost
+            raise DeviceError(
+                f"{self._name!r} took no zero: it reads {np.round(request.before, 3)} as before",
+                remedy="see that it accepts requests for a zero, and try again",
+            )
 
     def _done(self, request: _ZeroRequest) -> None:
         with self._lock:

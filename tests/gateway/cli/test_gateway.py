@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from palpate_deploy.cli.app import app
 from palpate_gateway.cli import inventory
 from palpate_gateway.drivers import driver_names
 from palpate_gateway.emulators.kms40 import Kms40Emulator
+from palpate_gateway.emulators.rdt import RdtEmulator
 
 PATIENCE_S = 30.0
 
@@ -134,6 +136,20 @@ def test_probe_of_a_device_that_falls_silent(kms40: Kms40Emulator) -> None:
     result = gateway("probe", *at(kms40), "--seconds", "0.3")
     assert result.exit_code == 1
     assert "was not answered" in result.stderr
+
+
+def test_probe_says_why_a_device_that_sends_gives_no_reading() -> None:
+    with RdtEmulator("netft") as rdt:
+        rdt.inject("error", PATIENCE_S)
+        host, _, port = rdt.address.partition(":")
+        words = ["product=ati_net_ft", f"host={host}", f"port={port}", f"http_port={rdt.page.port}"]
+        result = gateway("probe", "wrench_rdt", *words, "--seconds", "0.3")
+        assert result.exit_code == 1
+        assert "no reading came within 0.3 s, but it counted datagrams, invalid" in result.stderr
+        assert "fix: look these counters up" in result.stderr
+        assert re.search(r"counters   .*invalid_samples [1-9]", result.stdout)
+        result = gateway("probe", "wrench_rdt", *words, "--seconds", "0.3", "--json")
+        assert json.loads(result.stdout)["counters"]["invalid_samples"] > 0
 
 
 @pytest.mark.parametrize(

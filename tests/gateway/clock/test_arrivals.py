@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import pytest
+
 from palpate_gateway.clock.sample_times import ArrivalTimes
 
 MS = 1_000_000
@@ -76,6 +78,37 @@ def test_a_wrong_rate_does_not_make_times_lag() -> None:
     for k in range(1, 500):
         times = ms(arrivals.times_ns(30, round(60.6 * k * MS)))
         assert times[-1] == round(60.6 * k * MS) / MS
+
+
+@pytest.mark.parametrize(
+    ("set_hz", "clump", "every_ms"),
+    [(10.0, 1, 143), (250.0, 6, 60), (250.0, 1, 2), (200.0, 4, 10)],
+    ids=["slow", "slow in clumps", "fast", "two sensors"],
+)
+def test_another_rate_than_the_set_one_is_measured_and_makes_no_lag(
+    set_hz: float, clump: int, every_ms: int
+) -> None:
+    arrivals = ArrivalTimes(1.0 / set_hz)
+    true_hz = 1e3 * clump / every_ms
+    for now_ms in range(every_ms, 15_000, every_ms):
+        times = ms(arrivals.times_ns(clump, now_ms * MS))
+        assert now_ms - times[-1] <= 1e3 * clump / true_hz
+        assert times == sorted(set(times))
+    assert times[-1] == now_ms
+    assert arrivals.rate_hz == pytest.approx(true_hz, rel=0.01)
+    assert arrivals.counters["rate_not_as_configured"] > 0
+
+
+def test_pauses_of_the_process_are_no_other_rate() -> None:
+    """Every five seconds it stands still for two, and half a second is in the buffer."""
+    arrivals = ArrivalTimes(0.002)
+    for k in range(4):
+        for now_ms in range(7000 * k, 7000 * k + 5000, 2):
+            arrivals.times_ns(1, now_ms * MS)
+        times = ms(arrivals.times_ns(250, (7000 * k + 6998) * MS))
+        assert times[-1] == 7000 * k + 4998 + 500
+    assert arrivals.rate_hz == 500.0
+    assert arrivals.counters == {"rate_not_as_configured": 0}
 
 
 def test_a_new_stream_has_no_past() -> None:

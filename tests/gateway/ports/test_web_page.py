@@ -52,7 +52,10 @@ def test_no_page() -> None:
         read_page("page", timeout_s=10.0, most_bytes=10)
 
 
-@pytest.mark.parametrize("greeting", [b"HTTP/1.0 200 OK\r\n\r\n", b"hello\r\n", b""])
+@pytest.mark.parametrize(
+    "greeting",
+    [b"HTTP/1.0 200 OK\r\n\r\n", b"HTTP/1.0 200 OK\r\nX: ", b"hello\r\n", b""],
+)
 def test_a_page_that_trickles_or_is_none_is_given_up(greeting: bytes) -> None:
     stop = threading.Event()
 

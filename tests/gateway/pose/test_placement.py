@@ -117,6 +117,10 @@ GOOD = {
             {"base_sensor": {"position_m": [0, math.nan, 0], "orientation_wxyz": [1, 0, 0, 0]}},
             "is not finite",
         ),
+        (
+            {"base_sensor": {"position_m": [410, 0, 130], "orientation_wxyz": [1, 0, 0, 0]}},
+            "give metres, not mm",
+        ),
         ({"base_sensors": {}}, "did you mean 'base_sensor'"),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 from palpate.bus.topics import ROBOT_POSE, sensor_key
 from palpate.errors import ConfigError, RecordingError
 from palpate.files.record_writer import RecordWriter
-from palpate.messages import RobotPoseFrame
+from palpate.messages import Pose, RobotPoseFrame
 from palpate_gateway.drivers import make_device
 from palpate_gateway.readings import PoseReading
 
@@ -54,6 +55,15 @@ def test_recorded_poses_become_the_tip(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff([r.time_s for r in readings[:99]]), 0.004, atol=1e-9)
     assert readings[99].tick == 101
     assert start_wall_ns == WALL_NS + 1, "by the robot's clock, not by the recorder's"
+
+
+def test_recorded_millimetres_are_no_metres(tmp_path: Path) -> None:
+    far = replace(fakes.frame(3), pose_base_flange=Pose((400.0, 0.0, 300.0), (1.0, 0.0, 0.0, 0.0)))
+    path = write(tmp_path / "a.mcap", [fakes.frame(1), fakes.frame(2), far])
+    with make_device("pose_file", {"path": path, **fakes.BENCH}) as device:
+        assert len(device.read(1.0)) == 2
+        with pytest.raises(RecordingError, match=r"pose 3 is at \(400, 0, 300\) m, out of any"):
+            device.read(1.0)
 
 
 def test_another_placement_moves_the_tip(tmp_path: Path) -> None:

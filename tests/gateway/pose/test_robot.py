@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from palpate.bus.topics import ROBOT_POSE
 from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, DeviceLost, DeviceTimeout
-from palpate.messages import Origin
+from palpate.messages import Origin, Pose
 from palpate.v1 import robot_pb2
 from palpate_gateway.device import BusDevice
 from palpate_gateway.drivers import make_device
@@ -109,6 +110,13 @@ def test_losses_are_counted_and_told(device: BusDevice, told: Publisher[Any]) ->
     assert [reading.missed_before for reading in readings] == [0, 0, 2, 0]
     assert device.counters["lost_poses"] == 2
     assert device.counters["late_poses"] == 1
+
+
+def test_millimetres_are_no_metres(device: BusDevice, told: Publisher[Any]) -> None:
+    there = Pose((400.0, 0.5, 300.0), (1.0, 0.0, 0.0, 0.0))
+    told.put(replace(fakes.frame(1), pose_base_flange=there))
+    with pytest.raises(DeviceLost, match=r"\(400, 0\.5, 300\) m, out of any .* is this in mm\?"):
+        fakes.take(device, 1)
 
 
 def _damaged(**changes: float) -> bytes:

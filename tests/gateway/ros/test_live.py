@@ -28,6 +28,7 @@ from palpate_gateway.emulators.ros import (
     RosWrenchEmulator,
 )
 from palpate_gateway.readings import ElectrodeReading, Reading, WrenchReading
+from palpate_gateway.wrench.device import WrenchDevice
 
 HAND = "biotac_sensors/BioTacHand"
 ALL = "sr_robot_msgs/BiotacAll"
@@ -235,6 +236,21 @@ class TestWrench:
                     readings: list[WrenchReading] = take(device, 5)
                     assert np.abs([one.force for one in readings]).max() < 1e-9
                     assert device.counters.get("zero_lost", 0) == 0
+
+    def test_a_driver_of_ros_that_was_started_again_may_have_another_zero(self) -> None:
+        with RosWrenchEmulator(lambda t: (1.0, 2.0, 3.0, 0.1, 0.2, 0.3)) as emulator:
+            values = {"topic": emulator.topic, "connect": emulator.address}
+            device = make_device("ros_wrench", values)
+            assert isinstance(device, WrenchDevice)
+            with device:
+                device.take_zero()
+                assert not take(device, 1)[-1].force.any()
+                emulator.inject("restart")
+                with pytest.raises(DeviceLost, match="another publisher"):
+                    eventually(device, lambda: False)
+            with device:
+                assert device.zero_lost
+                np.testing.assert_allclose(take(device, 1)[-1].force, (1.0, 2.0, 3.0))
 
     def test_none_waits_at_a_thousand_messages_a_second(self) -> None:
         with RosWrenchEmulator(ramp, rate_hz=1000.0) as emulator:

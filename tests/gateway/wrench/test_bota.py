@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -14,6 +15,7 @@ from palpate.config import parse_config
 from palpate.errors import ConfigError, DeviceError, DeviceTimeout
 from palpate_gateway.emulators.bota import BotaEmulator
 from palpate_gateway.emulators.lines import SerialLine
+from palpate_gateway.protocols.bota import BotaFrame
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.bota import BotaOptions, WrenchBota
 
@@ -37,6 +39,14 @@ def is_of_sweep(reading: WrenchReading) -> bool:
 def make(sensor: BotaEmulator, **options: Any) -> WrenchBota:
     values = {"port": sensor.address} | options
     return WrenchBota(parse_config(BotaOptions, values, where="test"))
+
+
+def test_a_temperature_that_is_no_number_spoils_no_wrench() -> None:
+    device = WrenchBota(BotaOptions(port="a", rate_hz=400.0))
+    assert device._take(BotaFrame(0, LOAD, 1_000_000, math.nan)) is not None
+    assert device.counters.get("not_finite", 0) == 0
+    assert device._take(BotaFrame(0, (math.nan, *LOAD[1:]), 1_002_500, 20.0)) is None
+    assert device.counters["not_finite"] == 1
 
 
 @pytest.fixture

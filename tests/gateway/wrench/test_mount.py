@@ -9,7 +9,8 @@ import pytest
 
 from palpate.config import parse_config
 from palpate.errors import ConfigError
-from palpate_gateway.wrench.device import Mount, MountOptions
+from palpate_gateway.readings import WrenchReading
+from palpate_gateway.wrench.device import Mount, MountOptions, WrenchDevice, WrenchOptions
 
 FORCE, TORQUE = np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3])
 
@@ -56,6 +57,40 @@ def test_torque_is_about_the_sensor_frame() -> None:
     assert force @ here_v + torque @ here_w == pytest.approx(
         -(FORCE @ there_v + TORQUE @ there_w), rel=1e-5
     )
+
+
+class OneReading(WrenchDevice):
+    """Has no device; makes a reading of whatever it is told."""
+
+    def __init__(self, **options: Any) -> None:
+        values = parse_config(WrenchOptions, options, where="test")
+        super().__init__("test", "a test", 100.0, values)
+
+    def zero(self) -> None: ...
+
+    def _connect(self) -> str:
+        return "test"
+
+    def _close(self) -> None: ...
+
+    def _receive(self, timeout_s: float) -> list[WrenchReading]:
+        return []
+
+    def _protocol_counters(self) -> dict[str, int]:
+        return {}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 3.3e38, -1e39, 1e300])
+@pytest.mark.parametrize("mount", [{}, {"origin_m": [0.0, 0.0, 100.0]}])
+def test_garbage_is_counted_and_dropped(mount: dict[str, Any], wrong: float) -> None:
+    device = OneReading(mount=mount)
+    assert device._reading((wrong, 2.0, 3.0, 0.1, 0.2, 0.3)) is None
+    assert device._reading((1.0, 2.0, 3.0, 0.1, 0.2, -wrong)) is None
+    assert device.counters == {"not_finite": 2}
+    good = device._reading((1.0, 2.0, 3.0, 0.1, 0.2, 0.3))
+    assert good is not None
+    np.testing.assert_allclose(good.force, FORCE)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from tests.gateway.reading_devices import PATIENCE_S, Follower
 
 from palpate.config import parse_config
-from palpate.errors import ConfigError, DeviceError, DeviceTimeout
+from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.emulators.lines import SerialLine
 from palpate_gateway.emulators.robotous import (
     RobotousCanEmulator,
@@ -140,10 +140,11 @@ def test_zero_is_taken_in_the_sensor(sensor: RobotousEmulator) -> None:
         assert all(not reading.force.any() for reading in follower.more(10))
 
 
+@pytest.mark.parametrize("load", [LOAD, (0.36, -0.3, 0.38, 0.009, 0.0, -0.0095)])
 def test_a_zero_that_is_not_taken_is_told(
-    sensor: RobotousEmulator, monkeypatch: pytest.MonkeyPatch
+    sensor: RobotousEmulator, load: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sensor._source = lambda _: LOAD
+    sensor._source = lambda _: load
     answer = sensor._answer
     monkeypatch.setattr(sensor, "_answer", lambda r: answer(r) if r[0] != 17 else None)
     with make(line_of(sensor)) as device, pytest.raises(DeviceError, match="it took no zero"):
@@ -232,6 +233,24 @@ def test_others_on_the_bus_do_not_hide_silence(request: pytest.FixtureRequest) -
         follower.more()
         noise.stop()
         assert follower.counts()["other_ids"] > 0
+
+
+def test_two_sensors_with_the_same_identifiers_are_told(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("palpate_gateway.clock.sample_times._CHECK_NS", 200_000_000)
+    channel = request.node.name
+    options = {"interface": "virtual", "channel": channel, "rate_hz": 200}
+    with RobotousCanEmulator(sweep, channel=channel):
+        with RobotousCanEmulator(lambda _: LOAD, channel=channel), make(options) as device:
+            follower = Follower(device, WrenchReading)
+            follower.until(lambda: "more than one sensor" in str(follower.errors))
+            # It is not published again as long as there are two.
+            assert follower.readings
+            with pytest.raises(DeviceLost, match="more than one sensor"):
+                device.open()
+        with make(options) as device:
+            assert all(map(is_of_sweep, Follower(device, WrenchReading).more(300)))
 
 
 def test_nobody_there_is_told_with_the_request() -> None:

@@ -104,6 +104,26 @@ def test_an_overloaded_sensor_is_not_taken(bus: Any) -> None:
             ask_zero(bus)
 
 
+class DeafToZero(Kms40Emulator):
+    """It confirms a zero, and takes none."""
+
+    def _data_line(self) -> str:
+        tare, self._tare = self._tare, None
+        line = super()._data_line()
+        self._tare = tare
+        return line
+
+
+def test_a_zero_that_changes_nothing_is_no_success(bus: Any) -> None:
+    with (
+        DeafToZero(fakes.constant) as emulator,
+        bus.gateway(gateway("wrench_kms40", kms_options(emulator))),
+    ):
+        sensor(bus, SensorState.LIVE)
+        with pytest.raises(RemoteError, match=r"'ft' took no zero: it reads .* as before"):
+            ask_zero(bus)
+
+
 def test_a_restart_loses_the_zero_and_a_new_one_brings_it_back(bus: Any) -> None:
     with (
         Kms40Emulator(fakes.constant) as emulator,
