@@ -409,7 +409,7 @@ class SensorWorker:
         self._check_serving()
         self._tares.serve(
             answer,
-            lambda: self.pipeline.ask_tare(frames),
+            lambda: self.pipeline.ask_tare(frames, anyway=request.anyway),
             caller=caller,
             readings=frames,
             in_turn=False,

@@ -359,17 +359,20 @@ class Client(Closing):
         self._publishers.append(RobotPosePublisher(self.session, check_name(robot, "robot")))
         return self._publishers[-1]
 
-    def tare(self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0) -> Tare:
+    def tare(
+        self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0, anyway: bool = False
+    ) -> Tare:
         """Tare: take the present counts of the untouched finger as its baseline.
 
-        So many ``frames`` are averaged; 0 = the gateway's own number.
+        So many ``frames`` are averaged; 0 = the gateway's own number. A finger that is still, but
+        farther from where it last rested than it drifts, counts as held: it is tared if ``anyway``.
 
         Raises:
             ConfigError: A negative number.
             RemoteError: The gateway refuses, e.g. because the finger is touched.
         """
         _check_count(frames, "frames")
-        return ask_tare(self.session, sensor, frames=frames, timeout_s=timeout_s)
+        return ask_tare(self.session, sensor, frames=frames, timeout_s=timeout_s, anyway=anyway)
 
     def zero(self, sensor: str, *, readings: int = 0, timeout_s: float = 5.0) -> WrenchZero:
         """Take the present load of a force/torque sensor as zero.
