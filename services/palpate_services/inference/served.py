@@ -370,8 +370,8 @@ class ServedModels:
                 if wanted is not None and not remembered.changed:
                     _log.warning("%s; the profile counts again", error)
                     return Assignment(self._open(wanted), time.time_ns())
-                _log.error("%s: not served again: %s", sensor or "all sensors", error)
-                self._problems[sensor] = error
+                self._problems[sensor] = _not_again(sensor, current, error)
+                _log.error("%s", self._problems[sensor])
         previous = (
             Choice(remembered.previous, remembered.previous_sha256, None)
             if remembered.previous
@@ -390,6 +390,16 @@ class ServedModels:
                 }
             )
         self._owed.clear()
+
+
+def _not_again(sensor: str, choice: Choice, error: PalpateError) -> BundleError:
+    """Why a bundle that served before a restart does not; what to do depends on the sensor."""
+    whose, option = (f"sensor {sensor!r}", f" --sensor {sensor}") if sensor else ("all sensors", "")
+    return BundleError(
+        f"{choice.source} does not serve {whose} again: {error.problem}",
+        remedy=f"restore it and start the service again, or: palpate model load NAME{option}, or: "
+        f"palpate model unload{option}",
+    )
 
 
 def _listed(serving: Serving) -> tuple[ServedModel, ...]:
