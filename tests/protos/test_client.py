@@ -653,6 +653,26 @@ def test_an_async_stream_says_that_it_is_silent_and_goes_on(
     asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
 
 
+def test_an_async_stream_tells_of_another_sensor_though_its_task_is_slow(
+    link: LinkConfig, finger: Finger
+) -> None:
+    async def scene() -> None:
+        async with (
+            AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot,
+            robot.stream_features("finger", max_age_s=LIVE_S) as stream,
+        ):
+            await anext(stream)
+            finger.serial = "BT-OTHER"
+            skipped = stream.counters["skipped"]
+            while stream.counters["skipped"] < skipped + 20:  # enough to push it out
+                await asyncio.sleep(0.05)
+            with pytest.raises(SensorChanged):
+                await anext(stream)
+            assert (await anext(stream)).sensor_serial == "BT-OTHER"
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
 async def _begun(
     ask: Callable[[], Coroutine[Any, Any, object]], begun: threading.Event
 ) -> asyncio.Task[object]:
