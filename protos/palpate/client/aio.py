@@ -68,6 +68,7 @@ class AsyncStream(Generic[M]):
         check_process()
         if self._watch is None and not self._closed:
             await self._open()
+        item: M | PalpateError
         while not self._closed:
             with self._lock:
                 if self._changed is not None:
