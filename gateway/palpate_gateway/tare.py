@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -166,6 +168,13 @@ class TareLedger:
         return tare
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Request:
+    collector: TareCollector
+    future: Future[Tare]
+    anyway: bool
+
+
 class TareAttempts:
     """The attempts to tare one sensor: the gateway's own, and those that were requested.
 
@@ -175,18 +184,28 @@ class TareAttempts:
         frames: Frames in a tare, unless a request says otherwise.
         limits: Noise up to which a sensor counts as still.
         at_start: Whether to tare without a request, as soon as the sensor is still.
+        distance: A few words on how far a tare is from the untouched sensor, by more than drift;
+            empty = it is not.
     """
 
-    def __init__(self, frames: int, limits: StillLimits, *, at_start: bool) -> None:
+    def __init__(
+        self,
+        frames: int,
+        limits: StillLimits,
+        *,
+        at_start: bool,
+        distance: Callable[[Tare], str] = lambda _: "",
+    ) -> None:
         self.ledger = TareLedger()
         self.counters: dict[str, int] = {"tares": 0, "tares_refused": 0}
         self.error: DeviceError | None = None
         """Why the last attempt failed; None after a success."""
         self.frames = frames
         self._limits = limits
+        self._distance = distance
         self._own = TareCollector(frames, limits) if at_start else None
         self._lock = threading.Lock()
-        self._requested: list[tuple[TareCollector, Future[Tare]]] = []
+        self._requested: list[_Request] = []
         self._over = ""
 
     @property
@@ -199,11 +218,23 @@ class TareAttempts:
         if self._own is None:
             self._own = TareCollector(self.frames, self._limits)
 
-    def ask(self, frames: int, *, sensor: str, never: str = "") -> Future[Tare]:
+    def touched(self) -> None:
+        """The sensor is not untouched: it is not tared again without a request.
+
+        The next attempt waits until the sensor has been untouched for long enough. One without any
+        tare in force goes on: it has no level to be compared with.
+        """
+        if self._own is not None and self.ledger.current_id != NO_TARE:
+            self._own = self.error = None
+
+    def ask(
+        self, frames: int, *, anyway: bool = False, sensor: str, never: str = ""
+    ) -> Future[Tare]:
         """Tare with the next frames (0 = the usual number).
 
         Args:
             frames: How many.
+            anyway: Also where the sensor rests farther from its untouched level than it drifts.
             sensor: Its name, for errors.
             never: Why it can never be tared; empty = it can.
 
@@ -218,7 +249,7 @@ class TareAttempts:
                     f"{sensor} cannot be tared: {self._over or never}",
                     remedy="tare a live sensor, or ask for a known tare by its id",
                 )
-            self._requested.append((collector, future))
+            self._requested.append(_Request(collector, future, anyway))
         return future
 
     def offer(self, frame: ElectrodeFrame) -> list[Tare]:
@@ -232,17 +263,17 @@ class TareAttempts:
                 tares.append(tare)
         with self._lock:
             # A tare that nobody waits for any more must not come into force.
-            requested = [one for one in self._requested if not one[1].cancelled()]
+            requested = [one for one in self._requested if not one.future.cancelled()]
             self._requested = list(requested)
-        for collector, future in requested:
-            result = self._try(collector, frame)
+        for request in requested:
+            result = self._try(request.collector, frame, anyway=request.anyway)
             if result is None:
                 continue
             if isinstance(result, Tare):
                 tares.append(result)
             with self._lock:
-                self._requested = [one for one in self._requested if one[0] is not collector]
-            _answer(future, result)
+                self._requested = [one for one in self._requested if one is not request]
+            _answer(request.future, result)
         return tares
 
     def finish(self) -> None:
@@ -251,18 +282,19 @@ class TareAttempts:
             self._over = why = "the recording has ended"
             requested, self._requested = self._requested, []
         error = DeviceError(f"not tared: {why}", remedy="tare while the sensor delivers")
-        for _, future in requested:
-            _answer(future, error)
+        for request in requested:
+            _answer(request.future, error)
 
     def give_up(self, why: str) -> None:
         """The sensor is away: requests fail, and no tare averages frames of before and after."""
+        self.touched()  # for all that is known
         with self._lock:
             requested, self._requested = self._requested, []
         if self._own is not None:
             self._own = TareCollector(self.frames, self._limits)
         error = DeviceError(f"not tared: {why}", remedy="tare when the sensor delivers again")
-        for _, future in requested:
-            _answer(future, error)
+        for request in requested:
+            _answer(request.future, error)
 
     def resume(self, tare: Tare) -> None:
         """A tare of the run before is in force again; none is attempted without a request."""
@@ -274,9 +306,13 @@ class TareAttempts:
         self.ledger.enter(tare)
         self.counters["tares"] += 1
 
-    def _try(self, collector: TareCollector, frame: ElectrodeFrame) -> Tare | DeviceError | None:
+    def _try(
+        self, collector: TareCollector, frame: ElectrodeFrame, *, anyway: bool = False
+    ) -> Tare | DeviceError | None:
         try:
             tare = collector.add(frame)
+            if tare is not None and not anyway:
+                self._check_distance(tare)
         except DeviceError as error:
             self.error = error
             self.counters["tares_refused"] += 1
@@ -286,6 +322,15 @@ class TareAttempts:
             self.error = None
             self.recorded(tare)
         return tare
+
+    def _check_distance(self, tare: Tare) -> None:
+        distance = self._distance(tare)
+        if distance:
+            raise DeviceError(
+                f"cannot tare {tare.sensor_serial}: still, but {distance}",
+                remedy="take everything off the finger and tare again; if nothing touches it, it "
+                "has drifted that far: palpate tare NAME --anyway",
+            )
 
 
 def _answer(future: Future[Tare], result: Tare | DeviceError) -> None:

@@ -161,6 +161,12 @@ class StreamTimeout(PalpateError, TimeoutError):
     code = ErrorCode.DEADLINE_EXCEEDED
 
 
+class SensorChanged(PalpateError):
+    """Messages under the name of a sensor come from another one than before."""
+
+    code = ErrorCode.DEVICE
+
+
 class StaleError(PalpateError, TimeoutError):
     """The newest message is older than the caller accepts."""
 

@@ -281,8 +281,11 @@ def test_a_tare_over_many_frames_is_waited_for(monkeypatch: pytest.MonkeyPatch) 
         def serves(self, *_: object, **__: object) -> bool:
             return False
 
-    def ask(_: object, sensor: str, *, frames: int, timeout_s: float) -> None:
+    insisted: set[bool] = set()
+
+    def ask(_: object, sensor: str, *, frames: int, timeout_s: float, anyway: bool) -> None:
         given[frames] = timeout_s
+        insisted.add(anyway)
         raise StreamTimeout("silent", remedy="ask again")
 
     monkeypatch.setattr(Session, "open", lambda *_, **__: Joined())
@@ -292,6 +295,9 @@ def test_a_tare_over_many_frames_is_waited_for(monkeypatch: pytest.MonkeyPatch) 
     assert given == {0: 5.0, 800: 25.0}  # 800 frames at 100 Hz take 8 s
     CliRunner().invoke(app, ["tare", "--frames", "800", "--timeout-s", "3"])
     assert given[800] == 3.0
+    assert insisted == {False}
+    CliRunner().invoke(app, ["tare", "--anyway"])
+    assert insisted == {False, True}
     refused = CliRunner().invoke(app, ["tare", "--frames", "-3"])
     assert refused.exit_code == 2
     assert "--frames" in refused.output

@@ -14,7 +14,8 @@ import pytest
 
 from palpate.bus import Delivery
 from palpate.bus.topics import STATUS
-from palpate.errors import StreamTimeout
+from palpate.client.estimates import ask_tare
+from palpate.errors import RemoteError, StreamTimeout
 from palpate.health import _BURST, _CHANGES_HZ, Health, HealthReporter
 from palpate.messages import (
     ChannelFault,
@@ -28,6 +29,8 @@ from palpate_deploy.station.status import show_status
 from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator
 
 PAC, PDC = 22, 19
+PATIENCE_S = 30.0
+STARTING = SensorState.STARTING
 
 
 class Finger:
@@ -175,6 +178,33 @@ def test_a_sensor_that_is_gone_is_lost_and_comes_back(
     now = bus.state(ServiceState.READY)
     assert now.counters.get("silences", 0) + now.counters.get("device_lost", 0) >= 1
     assert now.counters["tares"] == 1, "a tare outlives a restart of the line"
+
+
+def test_a_held_finger_is_tared_only_if_it_is_insisted(
+    bus: Any, finger: Finger, served: Callable[..., SensorStatus]
+) -> None:
+    finger.pressed = True
+    served(lambda one, now: one.message.startswith("still, but not where it rested"))
+    with pytest.raises(RemoteError, match=r"still, but E\d is 400 counts from where") as caught:
+        ask_tare(bus.session, "thumb", frames=0, timeout_s=PATIENCE_S)
+    assert "palpate tare NAME --anyway" in caught.value.remedy
+    tare = ask_tare(bus.session, "thumb", frames=0, timeout_s=PATIENCE_S, anyway=True)
+    assert tare.pdc == pytest.approx(2900.0)
+    served(lambda one, now: one.message == "" and now.counters["tares"] == 2)
+
+
+def test_a_finger_without_frames_is_lost_though_its_device_measures_forces(bus: Any) -> None:
+    """It was live, at 0 frames a second, for as long as any reading of the device came."""
+    options = {"model": "formula", "faults": [{"kind": "lost", "at_s": 2.0, "for_s": 1.0}]}
+    states = bus.session.subscriber(STATUS, service="gateway", delivery=Delivery.QUEUE)
+    wanted = [SensorState.LIVE, SensorState.LOST, SensorState.LIVE]
+    with bus.gateway({"sensors": [{"driver": "virtual", "options": options}]}):
+        told: list[SensorState] = []
+        while told[-3:] != wanted:
+            (now,) = states.next(PATIENCE_S).message.sensor_states or [SensorStatus("", STARTING)]
+            if now.state not in (STARTING, *told[-1:]):
+                told.append(now.state)
+        assert bus.state(ServiceState.READY).counters["silences"] >= 1
 
 
 def test_a_sensor_that_stutters_does_not_flap(

@@ -12,7 +12,7 @@ from tests.gateway.pipelines import finished, pushed
 from palpate.errors import DeviceError
 from palpate.messages import NO_TARE, ElectrodeFrame, Origin, SensorType, Tare
 from palpate_gateway.clock.stamps import DueMessage, FileClock, LiveClock
-from palpate_gateway.condition.condition import RetareRules
+from palpate_gateway.condition.condition import RetareRules, TouchState
 from palpate_gateway.device import DeviceIdentity, DeviceInfo
 from palpate_gateway.readings import ElectrodeReading
 from palpate_gateway.service.pipeline import Pipeline
@@ -132,6 +132,71 @@ def test_a_press_that_stays_is_never_tared_away() -> None:
     push(made, finger.frames(1.0))
     finger.press(120.0)
     assert tares(push(made, finger.frames(15.0))) == []
+
+
+@pytest.mark.parametrize("at", [0, 10, 30, 48])
+@pytest.mark.parametrize("frames", [10, 50])
+def test_a_press_while_it_is_tared_again_is_not_tared_away(at: int, frames: int) -> None:
+    """So many frames after the attempt began it is pressed, and held."""
+    made = pipeline(retare=RetareRules(after_s=2.0), tare_frames=frames)
+    finger = fakes.Finger()
+    push(made, finger.frames(1.0))
+    finger.offset[:] = 15.0
+    while not made.counters["retares"]:
+        push(made, [finger.frame()])
+    before = tares(push(made, finger.frames(at * 0.01)))
+    finger.press(600.0)
+    assert tares(push(made, finger.frames(10.0))) == []
+    assert made.counters["retares"] == 1
+    assert made.tare_error is None, "nobody asked for it"
+    finger.press(0.0)
+    finger.offset[:] = 15.0 if not before else 30.0
+    (again,) = tares(push(made, finger.frames(5.0)))
+    assert (again.electrodes - finger.levels).mean() == pytest.approx(finger.offset.mean(), abs=2.0)
+
+
+def test_a_request_in_the_middle_of_a_hold_is_refused_unless_it_insists() -> None:
+    made, finger = pipeline(), fakes.Finger()
+    push(made, finger.frames(1.0))
+    finger.press(600.0)
+    push(made, finger.frames(2.0))
+    asked = made.ask_tare(0)
+    assert tares(push(made, finger.frames(1.0))) == []
+    with pytest.raises(
+        DeviceError,
+        match=r"still, but E\d+ is \d+ counts from where it last rested, and PDC 600.*--anyway",
+    ):
+        asked.result(timeout=0)
+    asked = made.ask_tare(0, anyway=True)
+    assert tares(push(made, finger.frames(1.0))) == [asked.result(timeout=0)]
+    assert made.condition is not None
+    push(made, finger.frames(1.0))
+    assert made.condition.level.touch is TouchState.UNTOUCHED
+
+
+def test_a_request_just_after_a_press_is_refused_as_well() -> None:
+    """Before the condition itself has seen that it is held."""
+    made, finger = pipeline(), fakes.Finger()
+    push(made, finger.frames(1.0))
+    finger.press(600.0)
+    asked = made.ask_tare(2)
+    push(made, finger.frames(0.02))
+    with pytest.raises(DeviceError, match="still, but E"):
+        asked.result(timeout=0)
+
+
+def test_another_finger_is_not_held_because_it_rests_elsewhere() -> None:
+    made, finger = pipeline(tare="query"), fakes.Finger()
+    made.ask_tare(0)
+    push(made, finger.frames(1.0))
+    made.begin(DeviceIdentity("BT2", 1 / 4400), LiveClock())
+    finger.press(600.0)  # its level, at rest
+    push(made, finger.frames(1.0))
+    assert made.condition is not None
+    assert made.condition.level.touch is TouchState.UNKNOWN
+    assert "tare_age_s" not in made.condition.gauges()
+    asked = made.ask_tare(0)
+    assert tares(push(made, finger.frames(1.0))) == [asked.result(timeout=0)]
 
 
 def test_a_sensor_with_one_sample_of_pac_a_frame_can_be_tared() -> None:

@@ -165,7 +165,7 @@ def examples() -> dict[str, Any]:
             1912.0,
             50,
         ),
-        "TareRequest": TareRequest(0xFEED, 50),
+        "TareRequest": TareRequest(0xFEED, 50, "asked by one", anyway=True),
         "WrenchZeroRequest": WrenchZeroRequest(100),
         "WrenchZero": WrenchZero(
             "FT-7",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import inspect
+import itertools
 import logging
 import math
 import signal
@@ -31,6 +32,7 @@ from palpate.errors import (
     ConfigError,
     LinkError,
     PalpateError,
+    SensorChanged,
     StaleError,
     StreamTimeout,
 )
@@ -62,6 +64,7 @@ class Finger:
         self._frame_of, self._estimate = frame_of, estimate
         self.delay_ns = 0
         self.silent = False
+        self.serial = estimate.sensor_serial
         self._stop = threading.Event()
         self.sequence = 0
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -75,7 +78,9 @@ class Finger:
                 stamp = dataclasses.replace(
                     stamp, monotonic_ns=max(stamp.monotonic_ns - self.delay_ns, 1)
                 )
-                self._publisher.put(dataclasses.replace(self._estimate, source=stamp))
+                self._publisher.put(
+                    dataclasses.replace(self._estimate, source=stamp, sensor_serial=self.serial)
+                )
 
     def close(self) -> None:
         self._stop.set()
@@ -180,6 +185,32 @@ def test_a_callback_runs_in_a_thread_of_ours_and_may_fail(
     called = watch.counters["called"]
     time.sleep(0.05)
     assert watch.counters["called"] == called, "closed is closed"
+
+
+def test_another_sensor_under_the_name_is_told_once(finger: Finger, robot: Client) -> None:
+    told: list[PalpateError] = []
+    called: list[str] = []
+    others = robot.stream_features("finger", max_age_s=LIVE_S)
+    with (
+        robot.stream_features("finger", max_age_s=LIVE_S) as stream,
+        others.call(lambda one: called.append(one.sensor_serial), on_error=told.append) as watch,
+    ):
+        before = next(stream).sensor_serial
+        assert robot.features("finger", max_age_s=LIVE_S).sensor_serial == before
+        assert robot.next_features("finger", timeout_s=LIVE_S).message.sensor_serial == before
+        finger.serial = "BT-OTHER"
+        with pytest.raises(SensorChanged, match=f"is of sensor BT-OTHER now, .* {before} -> if it"):
+            list(itertools.takewhile(lambda one: one.sensor_serial == before, stream))
+        assert next(stream).sensor_serial == "BT-OTHER"
+        with pytest.raises(SensorChanged):
+            list(iter(lambda: robot.features("finger", max_age_s=LIVE_S).sensor_serial, "BT-OTHER"))
+        assert robot.features("finger", max_age_s=LIVE_S).sensor_serial == "BT-OTHER"
+        with pytest.raises(SensorChanged):
+            list(iter(lambda: robot.next_features("finger").message.sensor_serial, "BT-OTHER"))
+        while "BT-OTHER" not in called:
+            time.sleep(0.01)
+        assert [type(error) for error in told] == [SensorChanged]
+        assert watch.counters["silences"] == 0
 
 
 def test_a_callback_is_told_of_a_silence_and_may_close_its_own_watch(
@@ -618,6 +649,26 @@ def test_an_async_stream_says_that_it_is_silent_and_goes_on(
             await stream.aclose()
             with pytest.raises(StopAsyncIteration):
                 await anext(stream)
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
+def test_an_async_stream_tells_of_another_sensor_though_its_task_is_slow(
+    link: LinkConfig, finger: Finger
+) -> None:
+    async def scene() -> None:
+        async with (
+            AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot,
+            robot.stream_features("finger", max_age_s=LIVE_S) as stream,
+        ):
+            await anext(stream)
+            finger.serial = "BT-OTHER"
+            skipped = stream.counters["skipped"]
+            while stream.counters["skipped"] < skipped + 20:  # enough to push it out
+                await asyncio.sleep(0.05)
+            with pytest.raises(SensorChanged):
+                await anext(stream)
+            assert (await anext(stream)).sensor_serial == "BT-OTHER"
 
     asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
 

@@ -112,6 +112,20 @@ def test_every_refusal_has_words(service: Service, reason: str) -> None:
         assert "break the message contract" not in error.message
 
 
+def test_the_reason_is_that_of_most_frames_not_of_the_last_one(service: Service) -> None:
+    for _ in range(20):
+        service.run(0.18, finger="invalid_channels")
+        service.run(0.02, finger="stale")
+    error = service.health.status().last_error
+    assert error is not None
+    assert "'finger' is refused (mostly invalid_channels): " in error.message
+    assert "load" not in error.remedy
+    service.run(REFUSED_S + TICK_S, finger="stale")  # and it follows what is refused now
+    error = service.health.status().last_error
+    assert error is not None
+    assert "'finger' is refused (stale): " in error.message
+
+
 def test_invented_names_take_no_memory(service: Service) -> None:
     for number in range(5000):
         service.report.refused(f"s{number}", "untared")

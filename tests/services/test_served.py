@@ -269,7 +269,8 @@ def test_nobody_else_serves_for_a_bundle_that_cannot_be_had_again(
     again = service()
     assert (of(again), of(again, "thumb")) == ("x:1", "none")
     assert again.problem is not None
-    assert "y" in again.problem.problem
+    assert "y:1 does not serve sensor 'thumb' again: " in again.problem.problem
+    assert "palpate model unload --sensor thumb" in again.problem.remedy
     entry = do(again, ModelAction.LIST).served[1]
     assert (entry.sensor, entry.name) == ("thumb", "")
     # Where it comes back, it serves after the next start; else another is chosen for the sensor.
@@ -321,6 +322,35 @@ def test_a_change_that_cannot_be_remembered_says_so(
     error = refused(started, LOAD, "x:2")
     assert "a restart would serve what was served before" in error.problem
     assert of(started) == "x:2"
+
+
+@pytest.mark.parametrize(
+    ("command", "serves"),
+    [
+        ((LOAD, "x:3"), "x:3"),
+        ((LOAD, "x"), "x:3"),
+        ((ROLL_BACK,), "x:1"),
+        ((UNLOAD,), "none"),
+        ((LOAD, "y", "any"), "y:1"),
+        ((UNLOAD, "", "any"), "x:2"),
+    ],
+)
+def test_a_command_given_again_is_remembered_and_takes_effect_once(
+    service: Service, monkeypatch: pytest.MonkeyPatch, command: Any, serves: str
+) -> None:
+    """As the error says: a second roll back undid the first, and a load only said all is well."""
+    started = service()
+    do(started, LOAD, "x:2")
+    if command == (UNLOAD, "", "any"):
+        do(started, LOAD, "x:1", "any")
+    with monkeypatch.context() as full:
+        full.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(OSError(28, "full")))
+        for _ in range(2):
+            assert "then give the command again" in refused(started, *command).remedy
+            assert of(started) == serves
+    do(started, *command)
+    again = service()
+    assert of(started) == of(again) == serves
 
 
 def test_memory_is_written_whole(service: Service, tmp_path: Path) -> None:

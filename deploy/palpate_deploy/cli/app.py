@@ -178,6 +178,12 @@ def tare(
             min=0, help="Frames (force/torque: readings) to average; 0 = the gateway's setting."
         ),
     ] = 0,
+    anyway: Annotated[
+        bool,
+        typer.Option(
+            "--anyway", help="Tare a finger that seems to be held: nothing touches it, it drifted."
+        ),
+    ] = False,
     timeout_s: Annotated[
         float | None,
         typer.Option(min=0, help="Longest time to wait [s]; default: enough for the frames."),
@@ -189,7 +195,14 @@ def tare(
     """Tare an untouched finger, or zero a force/torque sensor at its present load."""
     from palpate_deploy.station.tare import take_tare
 
-    take_tare(client_link(connect, tls), station, sensor, frames=frames, timeout_s=timeout_s)
+    take_tare(
+        client_link(connect, tls),
+        station,
+        sensor,
+        frames=frames,
+        anyway=anyway,
+        timeout_s=timeout_s,
+    )
 
 
 @app.command(

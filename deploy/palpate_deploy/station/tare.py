@@ -25,11 +25,18 @@ _SLOWEST_HZ = 10.0
 
 
 def take_tare(
-    link: LinkConfig, station: str, sensor: str, *, frames: int, timeout_s: float | None
+    link: LinkConfig,
+    station: str,
+    sensor: str,
+    *,
+    frames: int,
+    anyway: bool = False,
+    timeout_s: float | None,
 ) -> None:
     """Tare a BioTac or zero a force/torque sensor, and print the result.
 
-    Without a ``timeout_s`` there is time enough for so many frames of a slow sensor.
+    ``anyway`` is that of ``Client.tare``; a force/torque sensor does not look at it. Without a
+    ``timeout_s`` there is time enough for so many frames of a slow sensor.
 
     Raises:
         LinkError: There is no router, or no gateway serves that sensor.
@@ -50,7 +57,7 @@ def take_tare(
             zero()
             return
         try:
-            tare = ask_tare(session, sensor, frames=frames, timeout_s=wait_s)
+            tare = ask_tare(session, sensor, frames=frames, timeout_s=wait_s, anyway=anyway)
         except LinkError as not_found:
             try:
                 zero()

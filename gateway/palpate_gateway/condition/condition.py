@@ -81,11 +81,7 @@ class UntouchedLevel:
         """
         if self._level is None or self._tare is None:
             return
-        # Near the last untouched level, and near the tare: small steps must not add up to a press.
-        if not (
-            is_drift(electrodes - self._level[0], pdc - self._level[1], usable)
-            and is_drift(electrodes - self._tare[0], pdc - self._tare[1], usable)
-        ):
+        if self.distance(electrodes, pdc, usable):
             self.touch = TouchState.HELD
             return
         self.touch = TouchState.UNTOUCHED
@@ -93,6 +89,25 @@ class UntouchedLevel:
         distance = np.where(usable, np.abs(electrodes - self._tare[0]), 0.0)
         self.drift_electrode = int(np.argmax(distance))
         self.drift_counts = float(distance[self.drift_electrode])
+
+    def distance(self, electrodes: Floats, pdc: float, usable: _Usable) -> str:
+        """A few words on how far this is from the untouched sensor, by more than drift explains.
+
+        Empty = drift explains it, or nothing is known of the untouched sensor; as ``rests_at``
+        otherwise.
+        """
+        # Near the last untouched level, and near the tare: small steps must not add up to a press.
+        for from_, level in (("where it last rested", self._level), ("the tare", self._tare)):
+            if level is None:
+                continue
+            change, pdc_change = electrodes - level[0], pdc - level[1]
+            if not is_drift(change, pdc_change, usable):
+                worst = int(np.argmax(np.where(usable, np.abs(change), 0.0)))
+                return (
+                    f"E{worst + 1} is {abs(change[worst]):.0f} counts from {from_}, and PDC "
+                    f"{abs(pdc_change):.0f}"
+                )
+        return ""
 
 
 def is_drift(change: Floats, pdc_change: float, usable: _Usable) -> bool:
@@ -263,8 +278,13 @@ class Condition:
         """Present values; may be called from any thread."""
         return dict(self._gauges)
 
-    def begin(self) -> None:
-        """The device was opened, or opened again: what happened in between is unknown."""
+    def begin(self, *, exchanged: bool = False) -> None:
+        """The device was opened, or opened again: what happened in between is unknown.
+
+        ``exchanged`` = it is another finger: nothing is known of its level.
+        """
+        if exchanged:
+            self.level, self._tared_s = UntouchedLevel(), None
         self._blocks.begin()
         self._recent.clear()
         self.channels.begin()
@@ -277,6 +297,15 @@ class Condition:
         self._tared_s = tare.stamp.monotonic_ns * 1e-9
         self._untouched_since_s = None
         self._tell()
+
+    def distance(self, tare: Tare) -> str:
+        """How far a tare is from the untouched sensor, by more than drift; see ``UntouchedLevel``.
+
+        Empty also where no electrode is usable: nothing can be said then.
+        """
+        usable = self.channels.usable
+        electrodes = tare.electrodes.astype(np.float64)
+        return self.level.distance(electrodes, tare.pdc, usable) if usable.any() else ""
 
     def add(self, frame: ElectrodeFrame) -> bool:
         """Take a frame; whether a block was full, so that the condition was judged again."""

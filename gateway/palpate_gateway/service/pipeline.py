@@ -15,7 +15,7 @@ from palpate.codec import TARE as TARE_CODEC
 from palpate.errors import DeviceError, WireError
 from palpate.messages import NO_TARE, ElectrodeFrame, Tare
 from palpate_gateway.clock.stamps import ClockMap, DueMessage, Stamper
-from palpate_gateway.condition.condition import Condition, RetareRules
+from palpate_gateway.condition.condition import Condition, RetareRules, TouchState
 from palpate_gateway.condition.stillness import StillLimits
 from palpate_gateway.device import DeviceIdentity, DeviceInfo
 from palpate_gateway.kept_tare import KeptTare
@@ -68,7 +68,9 @@ class Pipeline:
         # A recording cannot wait for better frames.
         tare_limits = self._limits if info.live else electrodes_only
         self._tares_itself = tare != "query"
-        self._tares = TareAttempts(tare_frames, tare_limits, at_start=self._tares_itself)
+        self._tares = TareAttempts(
+            tare_frames, tare_limits, at_start=self._tares_itself, distance=self._distance
+        )
         self._retare = retare
         self.condition: Condition | None = None
         """Condition of the sensor; None = it has no electrodes, or was not opened yet."""
@@ -116,7 +118,7 @@ class Pipeline:
             rate_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
             self.condition = Condition(kind.layout, rate_hz, self._limits, self._retare)
         elif self.condition is not None:
-            self.condition.begin()
+            self.condition.begin(exchanged=exchanged)
         self._kind = kind
         if first:
             self._resume()
@@ -138,9 +140,10 @@ class Pipeline:
             self._tares.resume(tare)
             self.condition.tared(tare)
 
-    def ask_tare(self, frames: int) -> Future[Tare]:
+    def ask_tare(self, frames: int, *, anyway: bool = False) -> Future[Tare]:
         """Tare with the next frames (0 = the usual number); may be called from any thread.
 
+        ``anyway`` = also where the sensor rests farther from its untouched level than it drifts.
         A request that is cancelled before it has its frames leaves no tare.
 
         Raises:
@@ -149,6 +152,7 @@ class Pipeline:
         is_record = self._info.driver == "record"
         return self._tares.ask(
             frames,
+            anyway=anyway,
             sensor=self._serial or "the sensor",
             never="it is a record, which brings its own tares" if is_record else "",
         )
@@ -210,9 +214,16 @@ class Pipeline:
         """Update the condition of the sensor, and tare again where its rules say so."""
         condition = self.condition
         assert condition is not None, "begin() comes before push()"
-        if condition.add(frame) and condition.wants_tare and not self._tares.attempting:
+        if not condition.add(frame):
+            return
+        if condition.level.touch is not TouchState.UNTOUCHED:
+            self._tares.touched()
+        elif condition.wants_tare and not self._tares.attempting:
             self._counts["retares"] += 1
             self._tares.attempt()
+
+    def _distance(self, tare: Tare) -> str:
+        return "" if self.condition is None else self.condition.distance(tare)
 
     def _tare(self, frame: ElectrodeFrame, due_ns: int, put: Put) -> None:
         """Offer the frame to the tares that are under way, and publish those it completes."""

@@ -36,7 +36,7 @@ from palpate_gateway.clock.stamps import (
 )
 from palpate_gateway.clock.wall_clock import WallClock
 from palpate_gateway.device import Device, silence_of
-from palpate_gateway.readings import Reading
+from palpate_gateway.readings import ElectrodeReading, Reading
 from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.service.publication import LATE_S, MessagePublisher
 from palpate_gateway.service.requests import SensorRequests
@@ -323,9 +323,13 @@ class SensorWorker:
         turn_s = _TURN_S + self._key.patience_s if info.live else LATE_S
         while not self._stop.is_set():
             self._turns.next(turn_s)
+            readings, timeout = None, None
             try:
                 readings = self._read(min(silence.begin(), _READ_S))
             except DeviceTimeout as error:
+                timeout = error
+            heard = readings is not None and self._is_heard(readings)
+            if not heard:
                 if not silence.silent_s:
                     before = dict(self.device.counters)
                 silence.timed_out()
@@ -337,14 +341,15 @@ class SensorWorker:
                         before,
                         "check its power and cable; it is opened again by itself",
                     )
-                    raise DeviceLost(problem, remedy=remedy) from error
+                    raise DeviceLost(problem, remedy=remedy) from timeout
                 if silence.lost and self.serving and not self.silent:
                     self.silent = True
                     self._counters["silences"] += 1
                     self._report.is_silent(silence.silent_s)
+            if readings is None:
                 continue
             read_ns = time.monotonic_ns()
-            self.silent = False
+            self.silent = self.silent and not heard
             if not readings:
                 self.pipeline.finish(self._publisher.put)
                 self._report.tare_refused(self.pipeline.tare_error)
@@ -354,14 +359,21 @@ class SensorWorker:
             put = partial(self._publisher.put, read_ns=read_ns)
             self.pipeline.push(readings, read_ns, put, follow_later=self._calm_s > 0.0)
             self._health.worked()
-            self.serving = self._delivered = True
+            self.serving, self._delivered = self.serving or heard, True
             if self.zeroing is not None:
                 self._turns.next(LATE_S)
                 self.zeroing.follow(readings)
             if not self._calm_s:
                 self._follow_up()
-            silence.arrived()
+            if heard:
+                silence.arrived()
         return True
+
+    def _is_heard(self, readings: list[Reading]) -> bool:
+        """Whether these show that the sensor lives: of a finger, its frames, and nothing else."""
+        if not readings or not self.device.info.live or self.pipeline.condition is None:
+            return True
+        return any(isinstance(one, ElectrodeReading) for one in readings)
 
     def _calm(self) -> float:
         """How long after a frame the thread leaves the cores to others [s]; 0 = not at all."""
@@ -388,8 +400,9 @@ class SensorWorker:
         self._delivered = False
         self.pipeline.follow_up(self._publisher.put)
         self._report.tare_refused(self.pipeline.tare_error)
-        lost = self._wrench is not None and self._wrench.zero_lost
-        self._report.delivers(self.pipeline.condition, zero_lost=lost)
+        if self.serving and not self.silent:
+            lost = self._wrench is not None and self._wrench.zero_lost
+            self._report.delivers(self.pipeline.condition, zero_lost=lost)
 
     def _give_up(self, why: str) -> None:
         """Fail the requests: they must not wait for a sensor that is gone."""
@@ -416,7 +429,7 @@ class SensorWorker:
         self._check_serving()
         self._tares.serve(
             answer,
-            lambda: self.pipeline.ask_tare(frames),
+            lambda: self.pipeline.ask_tare(frames, anyway=request.anyway),
             caller=caller,
             readings=frames,
             in_turn=False,

@@ -22,7 +22,7 @@ from palpate.client.robot import Client
 from palpate.client.simulations import OnProgress, OnStep
 from palpate.client.streams import Stream, Watch
 from palpate.config import TlsConfig
-from palpate.errors import LinkError, PalpateError
+from palpate.errors import LinkError, PalpateError, SensorChanged
 from palpate.messages import SimulationReply, SimulationRequest
 
 M = TypeVar("M")
@@ -43,6 +43,8 @@ class AsyncStream(Generic[M]):
         self._arrived = asyncio.Event()
         self._lock = threading.Lock()
         self._items: deque[M | PalpateError] = deque(maxlen=depth)
+        # Told once: no newer message may push it out.
+        self._changed: SensorChanged | None = None
         self._skipped = 0
         self._watch: Watch[M] | None = None
         self._closed = False
@@ -66,8 +68,12 @@ class AsyncStream(Generic[M]):
         check_process()
         if self._watch is None and not self._closed:
             await self._open()
+        item: M | PalpateError
         while not self._closed:
             with self._lock:
+                if self._changed is not None:
+                    item, self._changed = self._changed, None
+                    break
                 if self._items:
                     item = self._items.popleft()
                     break
@@ -90,8 +96,13 @@ class AsyncStream(Generic[M]):
     def _offer(self, item: M | PalpateError) -> None:
         with self._lock:
             wake = not self._items
-            self._skipped += len(self._items) == self._items.maxlen
-            self._items.append(item)
+            if isinstance(item, SensorChanged):
+                self._skipped += len(self._items)
+                self._items.clear()  # of the one before
+                self._changed = item
+            else:
+                self._skipped += len(self._items) == self._items.maxlen
+                self._items.append(item)
         if wake:
             try:
                 self._loop.call_soon_threadsafe(self._arrived.set)

@@ -22,9 +22,12 @@ from palpate.messages import (
 )
 
 
-def ask_tare(session: Session, sensor: str, *, frames: int, timeout_s: float) -> Tare:
+def ask_tare(
+    session: Session, sensor: str, *, frames: int, timeout_s: float, anyway: bool = False
+) -> Tare:
     """The tare that a BioTac's gateway takes now, over so many ``frames``; 0 = its own number.
 
+    ``anyway`` = although it is still, but farther from where it last rested than it drifts.
     If this process ends or is interrupted, the token vanishes and the gateway drops the request.
 
     Raises:
@@ -32,7 +35,7 @@ def ask_tare(session: Session, sensor: str, *, frames: int, timeout_s: float) ->
         RemoteError: The gateway refuses, e.g. because the finger is touched.
         StreamTimeout: No answer in time.
     """
-    request = TareRequest(frames=frames, request_id=uuid.uuid4().hex)
+    request = TareRequest(frames=frames, request_id=uuid.uuid4().hex, anyway=anyway)
     with session.caller_token(request.request_id):
         return session.query(endpoints.TARE, request, sensor=sensor, timeout_s=timeout_s)
 

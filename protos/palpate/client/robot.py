@@ -44,7 +44,7 @@ from palpate.client.simulations import (
     ask_cancellation,
     ask_simulation,
 )
-from palpate.client.streams import Stream
+from palpate.client.streams import SameSensor, Stream
 from palpate.config import (
     STATION_VARIABLE,
     TlsConfig,
@@ -127,8 +127,8 @@ class Client(Closing):
         name = station or os.environ.get(STATION_VARIABLE) or "lab"
         self._lock = threading.Lock()
         # By topic and sensor, with a lock each: a subscriber belongs to one thread at a time.
-        self._newest: dict[tuple[str, str], tuple[Subscriber[Any], threading.Lock]] = {}
-        self._unseen: dict[tuple[str, str], Subscriber[Any]] = {}
+        self._newest: dict[tuple[str, str], tuple[Subscriber[Any], SameSensor, threading.Lock]] = {}
+        self._unseen: dict[tuple[str, str], tuple[Subscriber[Any], SameSensor]] = {}
         self._streams: list[Stream[Any]] = []
         self._publishers: list[RobotPosePublisher] = []
         self.session = Session.open(
@@ -144,6 +144,7 @@ class Client(Closing):
 
         Raises:
             StaleError: There is none, or the newest is older.
+            SensorChanged: It is of another sensor than the last one; told once.
         """
         return self._latest(FEATURES, sensor, max_age_s)
 
@@ -341,14 +342,19 @@ class Client(Closing):
 
         Raises:
             StreamTimeout: None came in time.
+            SensorChanged: It is the first of another sensor; told once.
         """
         check_process()  # before the lock, which a thread that is not here may hold
         check_duration(timeout_s, "timeout_s", most=LONGEST_S)
         key = (FEATURES.name, check_name(sensor, "sensor"))
         with self._lock:
             if key not in self._unseen:
-                self._unseen[key] = self.session.subscriber(FEATURES, sensor=sensor)
-        return self._unseen[key].next(timeout_s)
+                made = self.session.subscriber(FEATURES, sensor=sensor)
+                self._unseen[key] = made, SameSensor(made.key)
+            subscriber, same = self._unseen[key]
+        received: ReceivedMessage[FeatureEstimate] = subscriber.next(timeout_s)
+        same.check(received.message)
+        return received
 
     def robot_pose_publisher(self, robot: str) -> RobotPosePublisher:
         """A publisher of the poses of a robot's flange: call ``put`` from the control loop.
@@ -359,17 +365,20 @@ class Client(Closing):
         self._publishers.append(RobotPosePublisher(self.session, check_name(robot, "robot")))
         return self._publishers[-1]
 
-    def tare(self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0) -> Tare:
+    def tare(
+        self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0, anyway: bool = False
+    ) -> Tare:
         """Tare: take the present counts of the untouched finger as its baseline.
 
-        So many ``frames`` are averaged; 0 = the gateway's own number.
+        So many ``frames`` are averaged; 0 = the gateway's own number. A finger that is still, but
+        farther from where it last rested than it drifts, counts as held: it is tared if ``anyway``.
 
         Raises:
             ConfigError: A negative number.
             RemoteError: The gateway refuses, e.g. because the finger is touched.
         """
         _check_count(frames, "frames")
-        return ask_tare(self.session, sensor, frames=frames, timeout_s=timeout_s)
+        return ask_tare(self.session, sensor, frames=frames, timeout_s=timeout_s, anyway=anyway)
 
     def zero(self, sensor: str, *, readings: int = 0, timeout_s: float = 5.0) -> WrenchZero:
         """Take the present load of a force/torque sensor as zero.
@@ -496,11 +505,9 @@ class Client(Closing):
         with self._lock:
             first = key not in self._newest
             if first:
-                self._newest[key] = (
-                    self.session.subscriber(topic, sensor=sensor, delivery=Delivery.NEWEST),
-                    threading.Lock(),
-                )
-            subscriber, lock = self._newest[key]
+                made = self.session.subscriber(topic, sensor=sensor, delivery=Delivery.NEWEST)
+                self._newest[key] = made, SameSensor(made.key), threading.Lock()
+            subscriber, same, lock = self._newest[key]
         end_s = time.monotonic() + (self._timeout_s if first else 0.0)
         with lock:
             while True:
@@ -511,6 +518,7 @@ class Client(Closing):
                     if left_s <= 0.0:
                         raise
                 else:
+                    same.check(message)
                     return message
                 with contextlib.suppress(StreamTimeout):
                     subscriber.next(left_s)

@@ -17,7 +17,14 @@ from typing import Generic, Self, TypeVar
 from palpate import clock
 from palpate.bus import ReceivedMessage, Subscriber
 from palpate.config import check_duration
-from palpate.errors import LinkError, PalpateError, StaleError, StreamTimeout
+from palpate.errors import (
+    LinkError,
+    PalpateError,
+    SensorChanged,
+    StaleError,
+    StreamTimeout,
+    printable,
+)
 from palpate.process import Closing
 
 M = TypeVar("M")
@@ -36,13 +43,43 @@ _SAY_AGAIN_S = 10.0
 _END_S = 5.0
 
 
+class SameSensor:
+    """Notices when messages under one name come from another sensor than before.
+
+    Args:
+        key: Theirs, for errors.
+    """
+
+    def __init__(self, key: str) -> None:
+        self._key = key
+        self._serial = ""
+
+    def check(self, message: object) -> None:
+        """Look whose message this is; another sensor's from now on is what is expected.
+
+        Raises:
+            SensorChanged: It is another's than the last one's.
+        """
+        serial: str = getattr(message, "sensor_serial", "")
+        if not serial or serial == self._serial:
+            return
+        before, self._serial = self._serial, serial
+        if before:
+            raise SensorChanged(
+                f"{self._key} is of sensor {printable(serial)} now, before it was of "
+                f"{printable(before)}",
+                remedy="if it was exchanged, go on: this is told once; else look who else has its "
+                "name: palpate fleet",
+            )
+
+
 class Stream(Closing, Generic[M]):
     """Messages of one sensor, the newest first to come: ``for estimate in stream``.
 
     Ends when it or its client is closed, and belongs to one thread; ``close`` may be called from
     any. A consumer that is slower than the sensor skips messages (``dropped``), and so are those
     older than ``max_age_s`` skipped (``stale``). After ``timeout_s`` without a usable one it
-    raises; asked again, it goes on.
+    raises, and when messages begin to come from another sensor; asked again, it goes on.
 
     Args:
         subscriber: Belongs to this stream from now on.
@@ -69,6 +106,7 @@ class Stream(Closing, Generic[M]):
         self._wall_clock_error_s = wall_clock_error_s
         self._subscriber = subscriber
         self._closed = threading.Event()
+        self._same = SameSensor(subscriber.key)
         self._stale = 0
         self._watch: Watch[M] | None = None
 
@@ -86,6 +124,7 @@ class Stream(Closing, Generic[M]):
         Raises:
             StreamTimeout: None came within ``timeout_s``.
             StaleError: Some came, all of them too old, or stamped in the future.
+            SensorChanged: It is the first of another sensor in the place of the one before.
             LinkError: The client is closed.
         """
         end_s = time.monotonic() + self._timeout_s
@@ -97,6 +136,7 @@ class Stream(Closing, Generic[M]):
             try:
                 received = self._subscriber.next(min(left_s, _TURN_S))
                 self._check_age(received)
+                self._same.check(received.message)
             except StreamTimeout:
                 continue
             except StaleError as error:
@@ -158,7 +198,7 @@ class Watch(Closing, Generic[M]):
 
     An exception of the callback is logged and counted, and the stream goes on. ``on_error`` is
     called in the same thread when the stream was silent or stale for its ``timeout_s``, and again
-    for each further one; then, too, it goes on.
+    for each further one, and when another sensor is in its place; then, too, it goes on.
 
     ``counters``: those of the stream, ``called``, ``silences`` and ``callback_errors``.
     """
@@ -187,6 +227,10 @@ class Watch(Closing, Generic[M]):
                 return
             except (StreamTimeout, StaleError) as error:
                 self._counts["silences"] += 1
+                if self._on_error is not None:
+                    self._call(self._on_error, error)
+            except SensorChanged as error:
+                _log.warning("%s", error)
                 if self._on_error is not None:
                     self._call(self._on_error, error)
             except PalpateError as error:  # the client is closed

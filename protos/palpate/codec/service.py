@@ -362,9 +362,12 @@ TARE = codec_of(service_pb2.Tare, _tare_encode, _tare_from_wire)
 TARE_REQUEST: Codec[TareRequest] = codec_of(
     service_pb2.TareRequest,
     lambda r: service_pb2.TareRequest(
-        tare_id=r.tare_id, frames=r.frames, request_id=_check_request_id(r.request_id)
+        tare_id=r.tare_id,
+        frames=r.frames,
+        request_id=_check_request_id(r.request_id),
+        anyway=r.anyway,
     ).SerializeToString(),
-    lambda msg: TareRequest(msg.tare_id, msg.frames, _check_request_id(msg.request_id)),
+    lambda msg: TareRequest(msg.tare_id, msg.frames, _check_request_id(msg.request_id), msg.anyway),
 )
 SERVICE_REQUEST: Codec[ServiceRequest] = codec_of(
     service_pb2.ServiceRequest, lambda _: b"", lambda _: ServiceRequest()

@@ -129,11 +129,14 @@ class TareRequest:
     Attributes:
         frames: How many are averaged; 0 = the gateway's own number.
         request_id: Names the token that the caller holds while it waits; empty = it holds none.
+        anyway: Whether to tare although the finger is still, but farther from where it last rested
+            untouched than it drifts.
     """
 
     tare_id: int = NO_TARE
     frames: int = 0
     request_id: str = ""
+    anyway: bool = False
 
 
 @dataclass(frozen=True, slots=True)

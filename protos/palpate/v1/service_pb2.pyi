@@ -107,14 +107,16 @@ class Tare(_message.Message):
     def __init__(self, tare_id: _Optional[int] = ..., stamp: _Optional[_Union[_common_pb2.Stamp, _Mapping]] = ..., sensor_serial: _Optional[str] = ..., electrodes: _Optional[_Iterable[float]] = ..., electrodes_sd: _Optional[_Iterable[float]] = ..., pdc: _Optional[float] = ..., pac: _Optional[float] = ..., tac: _Optional[float] = ..., tdc: _Optional[float] = ..., frames_averaged: _Optional[int] = ...) -> None: ...
 
 class TareRequest(_message.Message):
-    __slots__ = ("tare_id", "frames", "request_id")
+    __slots__ = ("tare_id", "frames", "request_id", "anyway")
     TARE_ID_FIELD_NUMBER: _ClassVar[int]
     FRAMES_FIELD_NUMBER: _ClassVar[int]
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
+    ANYWAY_FIELD_NUMBER: _ClassVar[int]
     tare_id: int
     frames: int
     request_id: str
-    def __init__(self, tare_id: _Optional[int] = ..., frames: _Optional[int] = ..., request_id: _Optional[str] = ...) -> None: ...
+    anyway: bool
+    def __init__(self, tare_id: _Optional[int] = ..., frames: _Optional[int] = ..., request_id: _Optional[str] = ..., anyway: _Optional[bool] = ...) -> None: ...
 
 class WrenchZeroRequest(_message.Message):
     __slots__ = ("readings", "request_id")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import nan
@@ -62,18 +63,25 @@ first half second after its start for its tare."""
 _REFUSED_LEAST = 3
 _SILENT_S = 1.0  # nothing came for this long: there is nothing to answer
 _SENSORS_MOST = 256
+_LATELY = 100
+"""The reason is that of most of so many refusals: a few others come with each of them."""
 
 
 @dataclass(slots=True)
 class _Refusals:
-    """Refusals of one sensor since its last estimate."""
+    """Refusals of one sensor since its last estimate; ``frames`` are the first of each reason."""
 
-    count: int
     since_s: float
-    last_s: float
-    reason: str
-    frame: dict[str, object]
+    last_s: float = 0.0
+    count: int = 0
+    lately: deque[str] = field(default_factory=lambda: deque(maxlen=_LATELY))
+    frames: dict[str, dict[str, object]] = field(default_factory=dict)
     told: set[str] = field(default_factory=set)
+
+    @property
+    def reason(self) -> str:
+        """That of most of the last ones."""
+        return Counter(self.lately).most_common(1)[0][0]
 
 
 class InputReport:
@@ -121,15 +129,15 @@ class InputReport:
             return
         now_s = time.monotonic()
         found = self._refused.get(sensor)
-        if found is not None and found.reason == reason:
-            found.count, found.last_s = found.count + 1, now_s
-        elif found is not None or len(self._refused) < _SENSORS_MOST:
-            frame = {**about(sensor, stamp, tare_id=tare_id, model=model), "reason": reason}
-            if found is None:
-                self._refused[sensor] = _Refusals(1, now_s, now_s, reason, frame)
-            else:
-                found.count, found.last_s = found.count + 1, now_s
-                found.reason, found.frame = reason, frame
+        if found is None:
+            if len(self._refused) >= _SENSORS_MOST:
+                return
+            found = self._refused[sensor] = _Refusals(now_s)
+        found.count, found.last_s = found.count + 1, now_s
+        found.lately.append(reason)
+        if reason not in found.frames:
+            frame = about(sensor, stamp, tare_id=tare_id, model=model)
+            found.frames[reason] = {**frame, "reason": reason}
 
     def report(self) -> None:
         """Tell health; call it a few times a second."""
@@ -143,13 +151,14 @@ class InputReport:
             if found.count >= _REFUSED_LEAST and now_s > found.since_s + REFUSED_S
         }
         for sensor, found in wrong.items():
-            if found.reason not in found.told:
-                found.told.add(found.reason)
+            reason = found.reason
+            if reason not in found.told:
+                found.told.add(reason)
                 _log.warning(
                     "everything of sensor %s is refused: %s",
                     sensor,
-                    found.reason,
-                    extra=found.frame,
+                    reason,
+                    extra=found.frames[reason],
                 )
         if wrong:
             self._in_trouble = True
@@ -160,7 +169,9 @@ class InputReport:
 
     def _error(self, wrong: Mapping[str, _Refusals]) -> RemoteError:
         sensors = sorted(wrong)
-        reason = wrong[sensors[0]].reason
+        found = wrong[sensors[0]]
+        reason = found.reason
+        mostly = "mostly " if len(set(found.lately)) > 1 else ""
         try:
             code, problem, remedy = self._errors[EstimateRefusal(reason)]
         except (KeyError, ValueError):
@@ -168,7 +179,7 @@ class InputReport:
             remedy = "serve another bundle, and report this one to its maker"
         more = f" and {len(sensors) - 1} more" if len(sensors) > 1 else ""
         return RemoteError(
-            f"everything of sensor {sensors[0]!r}{more} is refused ({reason}): {problem}",
+            f"everything of sensor {sensors[0]!r}{more} is refused ({mostly}{reason}): {problem}",
             remedy=remedy,
             code=code,
         )

@@ -128,6 +128,8 @@ class ServedModels:
         self._loading = threading.Lock()
         self._changing = threading.Lock()
         self._problems: dict[str, PalpateError] = {}
+        self._owed: dict[str, ModelAction] = {}
+        """The last command to each sensor that took effect and could not be remembered."""
         wanted = {DEFAULT: config.bundle, **config.bundles}
         assigned: dict[str, Assignment] = {}
         self._serving = Serving(assigned)
@@ -189,16 +191,28 @@ class ServedModels:
         """
         began_s = time.monotonic()
         changed_s = None
-        if command.action is not ModelAction.LIST:
+        if command.action is not ModelAction.LIST and not self._given_again(command):
             before = self._serving.assigned.get(command.sensor, _NOTHING)
             choice = self._chosen(command, before)
-            changed_s = self._assign(command.sensor, choice, before)
+            changed_s = self._assign(command, choice, before)
         return ModelInventory(
             instance,
             _listed(self._serving),
             tuple(self._repository.available(self._task)),
             0.0 if changed_s is None else changed_s - began_s,
         )
+
+    def _given_again(self, command: ModelCommand) -> bool:
+        """Whether this command has taken effect already, and had only to be remembered.
+
+        A second roll back would undo the first. A load is known by what it loads.
+        """
+        action = command.action
+        with self._changing:
+            if action is ModelAction.LOAD or self._owed.get(command.sensor) is not action:
+                return False
+            self._remember()
+            return True
 
     def _chosen(self, command: ModelCommand, before: Assignment) -> Choice | None:
         """What a command wants to serve, loaded; None = nothing."""
@@ -236,11 +250,14 @@ class ServedModels:
         finally:
             self._loading.release()
 
-    def _assign(self, sensor: str, choice: Choice | None, before: Assignment) -> float | None:
+    def _assign(
+        self, command: ModelCommand, choice: Choice | None, before: Assignment
+    ) -> float | None:
         """Let a bundle serve; since when it does [s, monotonic], None = it did already.
 
         A roll back that came while it was loading is the newer order, and counts.
         """
+        sensor = command.sensor
         with self._changing:
             assigned = self._serving.assigned
             if assigned.get(sensor, _NOTHING) is not before:
@@ -251,12 +268,15 @@ class ServedModels:
                 )
             current = before.current
             if choice is not None and current is not None and current.runtime is choice.runtime:
+                if self._owed:
+                    self._remember()
                 return None
             changed = Assignment(choice, time.time_ns(), current, changed=True)
             self._serving = Serving({**assigned, sensor: changed})
             changed_s = time.monotonic()
             _log.info("%s: %s -> %s", sensor or "all sensors", _name(current), _name(choice))
             self._problems.pop(sensor, None)
+            self._owed[sensor] = command.action
             self._remember()
             return changed_s
 
@@ -350,8 +370,8 @@ class ServedModels:
                 if wanted is not None and not remembered.changed:
                     _log.warning("%s; the profile counts again", error)
                     return Assignment(self._open(wanted), time.time_ns())
-                _log.error("%s: not served again: %s", sensor or "all sensors", error)
-                self._problems[sensor] = error
+                self._problems[sensor] = _not_again(sensor, current, error)
+                _log.error("%s", self._problems[sensor])
         previous = (
             Choice(remembered.previous, remembered.previous_sha256, None)
             if remembered.previous
@@ -360,14 +380,26 @@ class ServedModels:
         return Assignment(current, time.time_ns(), previous, remembered.changed)
 
     def _remember(self) -> None:
-        if self._file is None:
-            return
-        self._file.keep(
-            {
-                sensor: Remembered(*_found_by(one.current), *_found_by(one.previous), one.changed)
-                for sensor, one in self._serving.assigned.items()
-            }
-        )
+        if self._file is not None:
+            self._file.keep(
+                {
+                    sensor: Remembered(
+                        *_found_by(one.current), *_found_by(one.previous), one.changed
+                    )
+                    for sensor, one in self._serving.assigned.items()
+                }
+            )
+        self._owed.clear()
+
+
+def _not_again(sensor: str, choice: Choice, error: PalpateError) -> BundleError:
+    """Why a bundle that served before a restart does not; what to do depends on the sensor."""
+    whose, option = (f"sensor {sensor!r}", f" --sensor {sensor}") if sensor else ("all sensors", "")
+    return BundleError(
+        f"{choice.source} does not serve {whose} again: {error.problem}",
+        remedy=f"restore it and start the service again, or: palpate model load NAME{option}, or: "
+        f"palpate model unload{option}",
+    )
 
 
 def _listed(serving: Serving) -> tuple[ServedModel, ...]:
