@@ -68,7 +68,7 @@ GATEWAY = Status(
     {"thumb.frames_published": 500, "thumb.silences": 3, "ring.frames_published": 400},
     {"thumb.tare_age_s": 61.0, "thumb.publish_p50_s": 3e-4, "ring.tare_drift_counts": 7.0},
     sensor_states=(
-        SensorStatus("thumb", SensorState.LIVE, 4 * 10**11),
+        SensorStatus("thumb", SensorState.LIVE, 4 * 10**11, (), "E7 has drifted: tare again"),
         SensorStatus("ring", SensorState.LOST, 9 * 10**11, (), "silent for 40 ms"),
     ),
 )
@@ -129,6 +129,7 @@ def test_figures_of_every_sensor() -> None:
         100.0,
         61.0,
     )
+    assert thumb.message == "E7 has drifted: tare again"
     assert thumb.publish.p50_s == 3e-4
     assert thumb.drops == {"silences": DropCount(3, 100.0)}
     assert thumb.state_age_s == pytest.approx(600.0)
@@ -152,7 +153,7 @@ def test_the_picture_shows_all_of_it(width: int) -> None:
         "fem backoff",
         "field silent",
         "router routes",
-        "thumb live 10:00 100 0.3 - 1:01",
+        "thumb live 10:00 100 0.3 - 1:01 - E7 has drifted:",
         "ring lost",
         "p50/p99 ms infer features 0.4/0.9",
         "features lost: stale 10 (+2.0/s)",
