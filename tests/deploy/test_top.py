@@ -31,7 +31,9 @@ from palpate.messages import (
 from palpate_deploy.station import observation
 from palpate_deploy.station.activity import DropCount, process_activities, sensor_activities
 from palpate_deploy.station.observation import ObservedProcess, StationObserver
+from palpate_deploy.station.status import shown_counters
 from palpate_deploy.station.top import run_top, screen
+from palpate_services.inference.estimates import EstimateRefusal
 
 PATIENCE_S = 20.0
 
@@ -119,6 +121,26 @@ def test_figures_of_every_process() -> None:
     assert (fem.state, fem.restarts) == ("backoff", 7)
     assert (field.state, field.in_hz) == ("silent", None)
     assert (router.state, router.uses.rss_bytes, router.pid) == ("routes", 7e7, 4700)
+
+
+LOSSES = (
+    *(one.value for one in EstimateRefusal if one is not EstimateRefusal.SKIPPED_RATE),
+    "sensors_refused", "unpublishable_location", "asked_no_model", "tares_refused",
+    "dropped_newest_wins", "overflow", "lost_on_bus", "reordered", "other_session", "unannounced",
+    "rejected_names", "lost_disk_full", "invalid_parse", "lost_with_record", "disk_failures",
+    "missing_frames", "frames_rejected", "silences", "device_lost", "invalid_samples",
+)  # fmt: skip
+"""Counters of what is lost, refused or not delivered, of every service."""
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_every_reason_of_a_loss_is_shown(name: str) -> None:
+    status = dataclasses.replace(FEATURES, counters={name: 7, "received": 9, "skipped_rate": 3})
+    (one,) = process_activities(
+        [ObservedProcess(ProcessReport("features", "features", True, True, status))]
+    )
+    assert one.drops == {name: DropCount(7, 0.0)}
+    assert shown_counters(status) == f"{name} 7"
 
 
 def test_figures_of_every_sensor() -> None:
