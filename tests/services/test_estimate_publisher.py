@@ -43,6 +43,7 @@ class Station:
         self.put: list[tuple[str, int]] = []
         self.counts: Counter[str] = Counter()
         self.gauges: dict[str, float] = {}
+        self.of_estimates: dict[str, float] = {}
         self.sensors: tuple[str, ...] = ()
         self.refused: EstimateRefusal | None = None
         self.batches: list[int] = []
@@ -90,6 +91,7 @@ class Station:
             worked=lambda: None,
             count=count,
             gauge=self.gauges.__setitem__,
+            set_gauges=lambda source, gauges: setattr(self, "of_estimates", gauges),
             set_sensors=lambda sensors: setattr(self, "sensors", sensors),
         )
         given: Any = {"bundle": "any", "max_age_s": None, "accept_replayed": True, **config}
@@ -196,7 +198,7 @@ def test_latency_counts_from_the_reading_where_its_clock_is_ours(
     station.now_ns, station.work_ns = START_NS + 3 * MS, MS // 2
     publisher.take([received])
     publisher.report(last=True)
-    assert station.gauges["latency_p50_s"] == pytest.approx(latency_s)
+    assert station.of_estimates["latency_p50_s"] == pytest.approx(latency_s)
 
 
 def test_gauges_are_of_the_last_period(station: Station, came: Came) -> None:
@@ -210,11 +212,12 @@ def test_gauges_are_of_the_last_period(station: Station, came: Came) -> None:
     station.now_ns = START_NS + 1000 * MS
     publisher.report()
     assert station.gauges["busy_ratio"] == pytest.approx(0.1)
-    assert station.gauges["latency_p50_s"] == pytest.approx(0.0505)
-    assert station.gauges["latency_p99_s"] == pytest.approx(0.09901)
-    station.gauges.clear()
+    assert station.of_estimates["latency_p50_s"] == pytest.approx(0.0505)
+    assert station.of_estimates["latency_p99_s"] == pytest.approx(0.09901)
+    assert station.of_estimates["batch_mean_samples"] == 1.0
     publisher.report(last=True)  # no time has passed, and nothing was published
     assert station.gauges == {"busy_ratio": 0.0}
+    assert station.of_estimates == {}, "old numbers are not shown as present ones"
 
 
 def test_counts_are_handed_over_five_times_a_second(station: Station, came: Came) -> None:

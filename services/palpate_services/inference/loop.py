@@ -382,19 +382,19 @@ class EstimatePublisher(Generic[M, E]):
             self._busy_ns = 0
             if self._duty is not None and not last:
                 self._duty.report()
+            gauges = self._stages.take()
             if self._latencies_ns:
                 p50, p99 = np.percentile(self._latencies_ns, (50, 99)) * 1e-9
-                self._health.gauge("latency_p50_s", float(p50))
-                self._health.gauge("latency_p99_s", float(p99))
+                gauges["latency_p50_s"], gauges["latency_p99_s"] = float(p50), float(p99)
                 self._latencies_ns = []
-            for name, seconds in self._stages.take().items():
-                self._health.gauge(name, seconds)
+            if self._batches:
+                gauges["batch_mean_samples"] = self._batched / self._batches
+                self._batches = self._batched = 0
+            # Those of a period without estimates are removed: old ones would pass as present.
+            self._health.set_gauges("estimates", gauges)
             if now_ns - self._forgot_ns >= _FORGET_NS:
                 self._forgot_ns = now_ns
                 self._forget_silent()
-            if self._batches:
-                self._health.gauge("batch_mean_samples", self._batched / self._batches)
-                self._batches = self._batched = 0
 
 
 def _without_repetition(
