@@ -30,6 +30,7 @@ PAGE = Path(__file__).parent / "results" / "attacks.md"
 
 HEAD = """# Attacks on a station with certificates
 
+Which attacks on a station with certificates are refused, and what the logs show.
 Made by `python -m docs.make_attacks`; the attacks are `tests/hostile/attacks.py`, whose tests
 assert what this page shows. The station runs `palpate up` with router, gateway and features, one
 virtual finger and one robot's poses, on one host; the attackers are Zenoh sessions, TLS clients and

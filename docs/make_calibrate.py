@@ -317,61 +317,66 @@ def page(facts: dict[str, Any]) -> str:
     least, most, real_least, real_most = min(twin), max(twin), min(others), max(others)
     return f"""# What a finger learns from its own presses
 
-Made by `python docs/make_calibrate.py runs ../shared/data`, whose head names the commands before
-it. `palpate calibrate` [chooses](../adr/0025-calibrated-fingers.md) among four estimators by their
-mean error on presses held out. The network has to know the finger as well: its error there, over
-0.5 N and the force, must be {LIKE_SIMULATED} at most in the median. It is
-{least:.2f} to {most:.2f} on the simulated specimens below, and
-{real_least:.2f} to {real_most:.2f} on the real fingers.
+How exact the forces of a finger are after `palpate calibrate`, on simulated and on real fingers.
+Made by `python docs/make_calibrate.py runs ../shared/data`; its docstring names the commands that
+make the data. `palpate calibrate` [chooses](../adr/0025-calibrated-fingers.md) among four
+estimators by their mean error on presses held out. The network may be chosen only if the finger is
+like simulated ones: its error there, divided by the sum of 0.5 N and the force, must be
+{LIKE_SIMULATED} at most in the median. It is {least:.2f} to {most:.2f} on the simulated specimens
+below, and {real_least:.2f} to {real_most:.2f} on the real fingers.
 
 ![errors](calibrate.png)
 
 ## Simulated fingers
 
-Specimens of the twin, neither of which nor whose skin the [population's network](population.md) has
-met. Median error of the force on all presses that were not learned from, and from 2 N in percent of
-the force; means over specimens and {facts["draws"]} draws of the presses. A force/torque sensor
-does not tell where a finger is touched; the network does (median error of the contact location).
+Specimens of the twin; the [population's network](population.md) was trained neither on them nor on
+their skin. Median error of the force on all presses that were not learned from, and from 2 N in
+percent of the force; means over specimens and {facts["draws"]} draws of the presses. A force/torque
+sensor does not measure where a finger is touched; the network estimates it (the last column is the
+median error of the contact location).
 `features-twin`, which was trained on the three that ship, has {own_n:.3f} N and
 {1e3 * own_m:.2f} mm on [presses like these](shipped.md).
 
 {markdown_table(head, rows)}
-How often the 90 % bounds of such a finger's bundle hold on its other presses, each press counting
-the same; of ten presses they promise more than is asked, since the next press is one more:
+The next table shows how often the 90 % bounds of such a finger's bundle hold on its other presses,
+each press counting the same. With ten presses the bounds are wider than needed, because the next
+press is counted as one more, with an error of any size:
 
 {markdown_table(["specimens", "bound of", "holds", "worst specimen", "median bound"], held)}
 ## Real fingers
 
-The two fingers of the LASA force calibration, from their first seconds, tested on the rest: median
-error of the magnitude [N], and in brackets the mean error on presses held out, which chooses.
+The two fingers of the LASA force calibration. Each is learned from its first seconds and tested on
+the rest: median error of the magnitude [N], and in brackets the mean error on presses held out, by
+which the estimator is chosen.
 
 {markdown_table(["", *names, "chosen"], real_rows)}
-So a network of simulated fingers is taken where a finger is like them, and not on a real one: there
-presses held out tell at once that it does not fit. The smooth finger that the gateway invents
-(`virtual`) is not like them either: 0.57 to 1.17 in eight draws of sixteen presses, and by the mean
-error alone the network would have been taken in five of them, wrongly (training/LOG.md).
+So the network of simulated fingers is chosen for a finger that is like them, and not for a real
+one, where presses held out show that it does not fit. The smooth finger that the gateway invents
+(`virtual`) is not like them either: 0.57 to 1.17 in eight draws of sixteen presses. By the mean
+error alone the network would wrongly have been chosen in five of them (training/LOG.md).
 
 ## With another finger
 
-`palpate calibrate --others FILE` is given presses of fingers that were pressed before: here of the
-other LASA finger. What they taught follows from one frame, without the electrodes' common mode
+`palpate calibrate --others FILE` also learns from presses of fingers that were pressed before, here
+of the other LASA finger. The estimate from them uses one frame, without the electrodes' common mode
 ([ADR 25](../adr/0025-calibrated-fingers.md)). Median error of the magnitude [N] / 95 % of the
 errors are below [N] / median angle [rad], on all that comes after the first seconds:
 
 {markdown_table(["", "its presses", "the other finger", "both", "always the mean"], with_other)}
-*Its presses*: the estimator that is chosen above. *Always the mean* of its presses. On finger 1
-presses held out would choose its own alone: they are neighbours of those that were learned from,
-and baselines wander for longer than a minute. So other fingers count wherever the finger is like
-them. Without a press of it, their median error over the force plus 0.5 N must be {LIKE_OTHERS}
-at most. It is {min(like):.2f} to {max(like):.2f} from one LASA finger to the other,
+*Its presses*: the estimator that is chosen above. *Always the mean*: that of its presses. On finger
+1, presses held out would choose the estimator of its own presses alone, because they follow closely
+on those that were learned from, and baselines drift for longer than a minute. So other fingers are
+used whenever the finger is like them. This is tested before any press of it is learned from: their
+median error, divided by the force plus 0.5 N, must be {LIKE_OTHERS} at most. It is
+{min(like):.2f} to {max(like):.2f} from one LASA finger to the other,
 {facts["foreign"]["real"]:.2f} and more from simulated specimens to these, and
 {facts["foreign"]["simulated"]:.2f} and more from these to simulated specimens.
 {PRESSES_OF_OTHERS} presses of its own count as much as all others. These two numbers were chosen
-on these two fingers, in both directions, the worse counting; of a third nobody knows.
+on these two fingers, by the worse of the two directions; they were not tested on a third finger.
 
-What such bundles say of themselves: how often the bounds of 90 % hold on all that comes later. A
-finger that was *never pressed* (`--presses 0`) is flagged `UNCALIBRATED`; its bounds are of the one
-other finger, each half estimated by the other half.
+The last table shows how often the 90 % bounds of such bundles hold on all that comes later. A
+finger that was *never pressed* (`--presses 0`) is flagged `UNCALIBRATED`; its bounds come from the
+one other finger, each half of which is estimated by the other half.
 
 {markdown_table(held_head, real_held)}"""
 

@@ -27,7 +27,7 @@ palpate is installed by `palpate install` in a Debian whose systemd runs: router
 field, recorder, metrics and finite elements, each with the certificates of its role, which systemd
 hands over (`LoadCredential`). The finger is an emulated BioTac on a serial line. A robot on another
 host, behind a cable of its own, notes every estimate and frame, and asks for a simulation each
-second. Everything is broken from outside. How to operate a station:
+second. A program outside of palpate causes the faults. How to operate a station:
 [operations.md](../operations.md).
 """
 
@@ -44,34 +44,36 @@ SEEN = {
 FOUND = """
 ## What the runs have found
 
-Mended:
+Corrected:
 
-* A robot on another host than the station's got answers and no stream at all: it joined as a peer,
-  which nobody can reach there. It now joins as a client of the router
+* A robot on another host than the station's got answers but no streams: it joined as a peer,
+  which other processes cannot reach there. It now joins as a client of the router
   (`tests/deploy/test_other_host.py` has two networks).
-* A disk that refuses to write left an empty `.mcap.part` with each attempt, for ever, and each
-  start of the recorder warned of each. They are removed now.
+* With a disk that refuses to write, each attempt left an empty `.mcap.part`, and each
+  start of the recorder warned of all of them. They are removed now.
 * A disk for the recordings alone, mounted below the station's folder, keeps systemd 257 from
   starting the unit. [install.md](../install.md) says where a disk of its own belongs.
 * In the namespaces of `make debian`, credentials did not reach a unit, because mounts were not
-  shared as container managers share them. Now they do: `LoadCredential` by role is what all
-  processes of this run live by.
-* A gateway that was started again while the finger was touched took no tare until it was let go,
-  and without a tare there is no estimate. It goes on with its last tare now
+  shared as container managers share them. Now they are: in this run all processes get their
+  certificates by `LoadCredential`.
+* A gateway that was restarted while the finger was touched took no tare until the finger was
+  released, and without a tare there is no estimate. It now goes on with its last tare
   ([tare and health](../tare-and-health.md)).
 * Zombies called `palpate`, one for each time that the sensor was unplugged, were not the station's:
-  the program that breaks things ended `nsenter` before that had waited for the emulated finger. It
-  waits now: unplugged 13 times in a row, it leaves none. Runs at commits before 6a113a6 have them.
-* Of four full disks one was not in the log: the recorder wrote it down only if its health was not
-  DEGRADED already, for another reason or still from the last time. Five of five are there since.
+  the program that causes the faults ended `nsenter` before that had waited for the emulated finger.
+  It waits now: unplugged 13 times in a row, it leaves none. Runs at commits before 6a113a6 have
+  them.
+* Of four full disks one was not in the log: the recorder logged it only if its health was not
+  DEGRADED already, for another reason or still from the last time. Since then five of five are.
 * A finger that is unplugged is shown as lost after 0.02 s. Runs at commits before c2646cc report
   0.22 s: the program looked only after it had finished unplugging, and saw the second status.
 
-Not mended:
+Not corrected:
 
-* A process that hangs is gone for others after the lease of a link, which is 2 s by default; the
-  reference measured with 1 s. On a busy host a shorter one takes links down that are well.
-* On a machine that is busy with other things, everything that starts Python anew waits for a
+* Other processes notice that a process hangs only after the lease of a link, which is 2 s by
+  default; the reference measured with 1 s. On a busy host a shorter lease closes links that are
+  well.
+* On a machine that is busy with other things, everything that starts Python again waits for a
   processor: the whole stack after a kill of its unit, and the finite elements. On an idle one
   `palpate bench restart` finds 1 to 3 s ([serving](serving.md)).
 """
@@ -101,11 +103,12 @@ def _availability(found: dict[str, Any]) -> str:
     asked, queries, records = share["asked"], found["queries"], found["recordings"]
     said = ", ".join(f"{count} {what}" for what, count in queries["said"].items())
     return (
-        f"A fresh estimate (30 ms old at most, of which the finger and its line take 12) was there "
-        f"for {100 * share['all']:.1f} % of the time, and for {100 * share['between_faults']:.1f} "
-        f"% of the {share['between_faults_s']:.0f} s outside of faults. A controller that asked "
-        f"{asked['asked']:,} times got one {asked['fresh']:,} times, and was told "
-        f"{asked['too_old']:,} times that there is none. The machine was not idle: "
+        "The robot had a fresh estimate (30 ms old at most; the finger and its line take 12 of "
+        f"them) for {100 * share['all']:.1f} % of the time, and for "
+        f"{100 * share['between_faults']:.1f} % of the {share['between_faults_s']:.0f} s outside "
+        "of faults. A controller that asked "
+        f"{asked['asked']:,} times got one {asked['fresh']:,} times, and an error "
+        f"{asked['too_old']:,} times. The machine was not idle: "
         f"{found['machine']['cpus']} cores, load {load['median']:.1f} in the median, "
         f"{load['least']:.1f} to {load['most']:.1f}.\n\n"
         f"{estimates['received']:,} estimates came, {1e3 * estimates['p50_s']:.1f} ms old in the "
@@ -185,9 +188,9 @@ def page(found: dict[str, Any]) -> str:
         f"![Share of time with a fresh estimate, and the faults](chaos.png)\n"
         f"\n## What must hold\n\n{_goals(found)}"
         f"\n## What the robot had\n\n{_availability(found)}"
-        f"\n## Each fault\n\nFrom the fault, or from its end where it lasts, until what it broke "
-        "works again: estimates, the process's token, its status, or an answer. Goals are those "
-        "of the serving reference, or this project's own.\n\n"
+        f"\n## Each fault\n\n*Over* counts from the fault, or from its end if it lasts, until what "
+        "it broke works again: estimates, the process's token, its status, or an answer. Goals are "
+        "those of the serving reference, or this project's own.\n\n"
         f"{_faults(found)}"
         f"\n## Two at once\n\n{_pairs(found)}"
         f"{_spoiled(found)}"

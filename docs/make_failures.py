@@ -32,33 +32,40 @@ HEAD = """\
 <!-- Written by docs/make_failures.py from the code; do not edit. -->
 # When something fails
 
-Every failure that palpate foresees says two things: what was wrong, and what to do about it. A
+Find an error message here and read what to do. Search this page for a few words of the message.
+`<...>` stands for what the message names in your case; where the code chooses between several
+wordings, they are separated by ` / `.
+
+Every error that palpate raises on purpose states the problem and a remedy. A
 command writes them as `error: ...` and `  fix: ...` and ends with 1 (failed), 2 (usage or
 configuration) or 3 (device or recording). A program gets a `PalpateError` with `problem`, `remedy`,
 `code` and `retry_after_s`. A process of a station reports them in its status, which
 `palpate status` prints.
 
-Search this page for a few words of the message. `<...>` stands for what the message names in your
-case; ways to say it that the code decides between are separated by ` / `.
-
-Whether a station is well: [operations.md](operations.md). A device that does not answer:
-[first-biotac.md](first-biotac.md#when-it-does-not-answer). A host that lacks something:
+To see whether a station works: [operations.md](operations.md). If a device does not answer:
+[first-biotac.md](first-biotac.md#when-it-does-not-answer). If the host lacks something:
 `palpate doctor`.
 """
 
 STATES = {
-    ServiceState.STARTING: ("It loads what it needs.", "Wait a few seconds; then see its log."),
+    ServiceState.STARTING: (
+        "It loads what it needs.",
+        "Wait a few seconds; if it lasts, see its log.",
+    ),
     ServiceState.READY: ("All is well.", "-"),
     ServiceState.DEGRADED: (
-        "It works with a loss.",
+        "It works, but something is lost.",
         "Do what `palpate status` prints under it: the last error with its own remedy.",
     ),
     ServiceState.FINISHED: ("Its finite source, e.g. a recording, has ended.", "-"),
     ServiceState.STOPPING: ("It has been told to end.", "-"),
 }
 SENSOR_STATES = {
-    SensorState.UNKNOWN: ("A state of a newer palpate.", "Upgrade this host."),
-    SensorState.STARTING: ("No reading has come yet.", "Power, cable, address: `palpate doctor`."),
+    SensorState.UNKNOWN: ("The state comes from a newer palpate.", "Upgrade this host."),
+    SensorState.STARTING: (
+        "No reading has come yet.",
+        "Check power, cable and address: `palpate doctor`.",
+    ),
     SensorState.LIVE: ("It delivers.", "-"),
     SensorState.WARMING: (
         "Its temperature has not settled, so baselines drift.",
@@ -70,34 +77,34 @@ SENSOR_STATES = {
     ),
     SensorState.LOST: (
         "It is silent, or gone.",
-        "Cable and power; the gateway finds it again by itself.",
+        "Check cable and power; the gateway finds it again by itself.",
     ),
     SensorState.ENDED: ("A recording is over, or has failed.", "-"),
 }
 FAULTS = {
-    FaultKind.UNKNOWN: ("A fault of a newer palpate.", "Upgrade this host."),
+    FaultKind.UNKNOWN: ("The fault comes from a newer palpate.", "Upgrade this host."),
     FaultKind.SATURATED: ("The channel is at an end of its range.", "Press less."),
     FaultKind.DEAD: (
         "No valid word, or an end of the range while nothing touches the finger.",
-        "Plug and cable; else the electrode has lost its fluid or its wire.",
+        "Check plug and cable; if they are well, the electrode has lost its fluid or its wire.",
     ),
     FaultKind.STUCK: (
-        "Its value stands still where it cannot.",
+        "Its value does not change, as that of an intact channel would.",
         "Unplug the finger and plug it in again; a line that repeats old words has to be reset.",
     ),
     FaultKind.ODD: (
-        "It delivers, at a level that an intact finger does not have at rest.",
+        "Its values change, but their level at rest is not that of an intact finger.",
         "Look for an air bubble or too little fluid, as the maker's manual says.",
     ),
 }
 FLAGS = {
     QualityFlag.UNKNOWN: "Upgrade this host.",
     QualityFlag.STALE: "Ask for a newer frame, or allow a larger age.",
-    QualityFlag.SATURATED: "Press less; the force is at least what is said.",
+    QualityFlag.SATURATED: "Press less; the force is at least the estimate.",
     QualityFlag.UNTARED: "Let go and `palpate tare NAME`.",
     QualityFlag.OUT_OF_RANGE: "Do not act on it; train or calibrate with touches like this one.",
-    QualityFlag.EXTRAPOLATING: "Take it as `at least`; train with larger touches.",
-    QualityFlag.RANGE_UNKNOWN: "`palpate train upgrade` writes what it was trained on.",
+    QualityFlag.EXTRAPOLATING: "Take the value as a lower bound; train with larger touches.",
+    QualityFlag.RANGE_UNKNOWN: "`palpate train upgrade` writes the training range into the bundle.",
     QualityFlag.UNCALIBRATED: "`palpate calibrate NAME` makes a bundle for this finger.",
 }
 REFUSALS = {
@@ -107,9 +114,9 @@ REFUSALS = {
     EstimateRefusal.WRONG_SENSOR: "Load a bundle of this kind of sensor: `palpate model load`.",
     EstimateRefusal.WRONG_MESH: "Use field and synthesis bundles of one mesh.",
     EstimateRefusal.NON_FINITE: "`palpate model verify` the bundle; report the frame.",
-    EstimateRefusal.STALE: "Find what is slow in `palpate top`; or raise `max_age_s`.",
+    EstimateRefusal.STALE: "Find the slow stage in `palpate top`, or raise `max_age_s`.",
     EstimateRefusal.CLOCK_SKEW: "Set the clocks of both hosts ([time](time.md)).",
-    EstimateRefusal.REPLAYED: "`accept_replayed = true`, where nothing moves a robot.",
+    EstimateRefusal.REPLAYED: "Set `accept_replayed = true` if no robot moves by these estimates.",
     EstimateRefusal.NO_MODEL: "`palpate model load NAME --sensor SENSOR`.",
     EstimateRefusal.SKIPPED_RATE: "Not a failure; a larger `rate_hz` publishes more.",
 }

@@ -29,15 +29,16 @@ _TRIES = 20
 
 HEAD = """# Faults: how they show, and how soon they are over
 
+How each fault of each emulated device is reported, and how soon the device works again afterwards.
 Made by `python -m docs.make_faults`: the gateway's own worker and pipeline read each device in
-software, which has each of its faults for {lasts} s, and outages for {long} s, too. Every message
-is compared with the load or the counts of the device at that time.
+software. Each device has each of its faults for {lasts} s, and outages also for {long} s. Every
+message is compared with the load or the counts of the device at that time.
 
-*Shows as*: counters and errors that show it (those in `tests/gateway/fault_names.py`). *Wrong*:
-messages with values that were not measured, or with a time before that of the last one, of all
-messages from the begin of the fault until the device works again. *Over after*: time from the end
-of the fault to the first of several good messages in a row, after {lasts} s and, at worst, after an
-outage. The goal is 1 s.
+*Shows as*: counters and errors that report it (those in `tests/gateway/fault_names.py`). *Wrong*:
+the number of messages with values that were not measured, or with a time before that of the message
+before, out of all messages from the begin of the fault until the device works again. *Over after*:
+time from the end of the fault to the first of several good messages in a row, after {lasts} s and,
+in the last column, the longest after an outage. The goal is 1 s.
 
 """
 

@@ -38,13 +38,14 @@ PAGE = FOLDER.with_suffix(".md")
 
 HEAD = """# Many indentations at once on a GPU
 
+How fast a GPU simulates presses, and how well it agrees with the solver on a core.
 `python docs/make_fem_batched.py` makes this page from what the commands below measured. How it
 works: [ADR 26](../adr/0026-many-at-once.md). The presses are the twin's: nine indenters, 3 mm along
 the normal and 1.5 mm at 30 degrees to it, 20 steps, friction and core contact. A *trajectory* is
 one press; a *slot* is a place for one press on the GPU.
 
-At the end of a batch slots are empty, because no press is left. In a long sweep that end is short,
-so the table also has the time with all slots taken.
+At the end of a batch some slots are empty, because no press is left. In a long sweep this end is a
+small part, so the table also has the time with all slots taken.
 """
 
 
@@ -273,8 +274,8 @@ def main() -> None:
         " process, without the service.\n",
         served(asked),
         f"\nThe solver's process was killed (SIGKILL) while 32 callers had requests there:"
-        f" `{asked['killed']['command']}`. All were answered: workers on cores took them first, the"
-        " next process of the solver took over what still waited.\n",
+        f" `{asked['killed']['command']}`. All were answered: first workers on cores took them,"
+        " then the solver's next process took those that still waited.\n",
         served(asked["killed"]),
     ]
     PAGE.write_text("\n".join(sections) + "\n", encoding="utf-8")

@@ -106,12 +106,13 @@ CLAMP = """
 The long cylinder is as long as the finger. Where it is tilted towards the tip (`angled-0`), its
 other end meets the rim that the clamp holds: the force is that of the rim, not of a pinch.
 
-The skin *snaps* where the force falls while a ball or a cylinder moves in; the trajectory ends
+The skin *snaps* if the force falls while a ball or a cylinder moves in; the trajectory ends
 before that step. It happens where 1.2 to 1.4 mm of the 1.57 mm of skin are squeezed
-away. The force before the snap does not depend on the mesh: at 3.35 mm under `sphere_medium` it is
+away. Before the snap the force does not depend on the mesh: at 3.35 mm under `sphere_medium` it is
 12.15 N with edges of 0.6 mm and 12.14 N with 0.45 mm. The force at the snap does: 17 and 22.5 N. A
-volume barrier five times as stiff moves it to 22 N. So where the skin snaps is a property of the
-elements, which are stretched to three times their length there, and not of the finger.
+volume barrier five times as stiff moves it to 22 N. So the force at which the skin snaps is a
+property of the elements, which are stretched to three times their length there, and not of the
+finger.
 """
 
 PAPER_MM = {"normal": 3.0, "angled": 1.5}

@@ -103,8 +103,8 @@ def results_page(values: Mapping[str, Any]) -> str:
     return f"""# Fleets: what stations behind a site's router cost
 
 <!-- Written by docs/make_fleet.py from fleet.json; do not edit. -->
-Measured by `palpate bench fleet --out docs/results/fleet.json`, as root: every station, the site
-and the consumer is a network namespace of one host, joined by virtual cables (veth), with mutual
+Measured by `palpate bench fleet --out docs/results/fleet.json`, as root. Every station, the site
+and the consumer is a network namespace of one host; virtual cables (veth) join them, with mutual
 TLS. All of them share
 {machine["cpus"]} cores ({machine["cpu"]}; load {
         machine["load_1min"]
@@ -125,8 +125,8 @@ cable, both ways, with all framing. Latency is from the stamp to the consumer, t
             rows,
         )
     }
-The floor is the same process with a consumer that is linked to it directly, over one cable and
-without a router, at the same time.
+The floor is the latency of the same process, at the same time, to a consumer that is linked to it
+directly, over one cable and without a router.
 
 {_table("stations | floor p50, p99 ms | raw frames: times the floor's p50 | p99", floors)}
 ## A whole station
@@ -139,10 +139,10 @@ Router, gateway of one virtual finger and features service, each a process.
 {_table("tc netem | what one consumer of one station saw", impaired)}
 ## A standby takes over
 
-Two features services on two hosts serve one finger; the host of the active one fails. The gap is
-the longest pause between estimates at a consumer, one trial a line; "twice" are estimates of one
-frame that came from both, until 8 s after the fault was over. A subscriber of palpate drops and
-counts those; this consumer took what crossed the cable.
+Two features services on two hosts serve one finger; the host of the active one fails. Each line is
+one trial. The gap is the longest pause between estimates at a consumer; "twice" counts estimates of
+one frame that came from both services, until 8 s after the fault was over. A subscriber of palpate
+drops and counts those; this consumer took everything that crossed the cable.
 
 {_table("the active one is | gap, s | twice | out of order", takeovers)}
 ## A simulation is asked again

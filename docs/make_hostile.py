@@ -27,11 +27,12 @@ BYTES_MAX = 500_000_000
 
 HEAD = """# Bad bundles and records: refused soon, by name, with little memory
 
-Made by `python -m docs.make_hostile`. Each file is given to `palpate model verify`, or to
+What bad bundles and records do to the commands that read them. Made by
+`python -m docs.make_hostile`: each file is given to `palpate model verify`, or to
 `palpate info`, in a process of its own. *Time* counts from the start of Python; *memory* is the
-largest resident memory of the command, or of the child in which it tries a model. The goal is a
-typed error within {seconds:.0f} s and {megabytes:.0f} MB; the first row of each table is a good
-file, for comparison. The files are made by `tests/hostile/`, whose tests assert the bounds.
+largest resident memory of the command, or of the child process in which it tries a model. The goal
+is a typed error within {seconds:.0f} s and {megabytes:.0f} MB; the first row of each table is a
+good file, for comparison. The files are made by `tests/hostile/`, whose tests assert the bounds.
 
 """
 

@@ -26,7 +26,8 @@ PARTS = {
 
 HEAD = """# Install: from a Debian with only Python to nothing left
 
-Made by `make debian`, which needs root, debootstrap and a network, and by
+What an installation writes, how far its units are shut off from the host, and what an uninstall
+leaves. Made by `make debian`, which needs root, debootstrap and a network, and by
 `python docs/make_install.py`.
 How to install: [install.md](../install.md).
 """
@@ -52,8 +53,8 @@ def _list(lines: list[str]) -> str:
 def _chroot(values: dict[str, Any]) -> str:
     return (
         f"{_steps(values, 'chroot')}\n"
-        "A user without rights, a system that is read-only but for the station's folders, a "
-        "network that is loopback alone. The robot got "
+        "The commands ran as a user without rights, on a system that is read-only except for the "
+        "station's folders, with loopback as the only network. The robot got "
         f"{values['estimates']} estimates, the simulation ended with `{values['simulation']}`, "
         f"{values['recorded_bytes'] / 1e6:.1f} MB "
         "were recorded.\n\n`palpate install` made: "
@@ -119,8 +120,8 @@ def _scores(values: dict[str, Any]) -> str:
         "`systemd-analyze security --offline=true`: 0 = closed, 10 = open; the goal is 1.5, a "
         "unit with nothing but its command has "
         f"{scores['bare']['palpate']}. The profiles are those of `tests/install/cases.py`: what "
-        "they name has to be let through. "
-        f"Memory that is written and run is forbidden to all but the finite elements.\n\n"
+        "they name has to be allowed. "
+        f"Only the finite elements may have memory that is both writable and executable.\n\n"
         f"{_table('profile | palpate@ | palpate-fem@', rows)}"
     )
 

@@ -507,7 +507,7 @@ def page(facts: dict[str, Any]) -> str:
     if real:
         parts += [
             markdown_table(BOUND_HEAD, bound_rows(real)),
-            "\nThe method for fingers that training has not met ([transfer](transfer.md)) makes its"
+            "\nThe method for fingers that training has not met ([transfer](transfer.md)) has its"
             " own intervals of the magnitude:\n",
             markdown_table(
                 ["finger", "labelled presses", "holds", "half width"],
@@ -548,7 +548,8 @@ FLAG_HEAD = ["bundle", "presses", "number", "falsely flagged", "95 % interval"]
 
 HEAD = """# How often the bounds of estimates hold
 
-A *bound* says how far an estimate may be off ([ADR 0031](../adr/0031-intervals.md)). Goal: a bound
+A *bound* states how far an estimate may be off ([ADR 0031](../adr/0031-intervals.md)). This page
+shows how often bounds hold. Goal: a bound
 of 90 % holds in 90 ± 3 % of the rows, each press counting the same. Written by
 `python docs/make_intervals.py runs ../shared/data`; numbers in [intervals.json](intervals.json).
 
@@ -585,10 +586,10 @@ palpate data generate runs/drawn --points 2 --angled 2 --seed 13 --units drawn.j
 vector. *Specimens never met* are simulated fingers that neither training nor calibration has seen.
 """
 
-REAL = """For a sensor that a bundle was not made for, it gives the bounds that real fingers needed.
-Two real fingers prove nothing for a third; the table shows how often the bounds of one hold on the
-other. *Bounds that ship* know both fingers; *as if it were the twin's* takes the bounds for fingers
-that the bundle was made for.
+REAL = """For a sensor that a bundle was not made for, its bounds are as wide as the errors on real
+fingers. What holds for two real fingers need not hold for a third; the table shows how often the
+bounds of one hold on the other. *Bounds that ship* know both fingers; *as if it were the twin's*
+takes the bounds for fingers that the bundle was made for.
 """
 
 FLAGS = """Rows of simulated presses, which neither training nor calibration has seen, that are

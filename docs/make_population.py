@@ -361,10 +361,12 @@ def last_cell(report: dict[str, Any]) -> dict[str, Any]:
 
 HEAD = """# A population of simulated BioTacs
 
-Made by `python docs/make_population.py`; its docstring names the commands before it. Everything
-here is simulated. A *fingertip* has a skin, fill and friction of its own and is indented by finite
-elements. Each fingertip has several *specimens*, which differ in electrodes, fluid, place of the
-core, noise and warmth ([priors](twin/units.md), `palpate_fem.population.fingertips`).
+A large set of presses on many different simulated fingertips, and how well one network estimates
+forces on fingers that it was not trained on.
+Made by `python docs/make_population.py`; its docstring names the commands that make the data.
+Everything here is simulated. A *fingertip* has a skin, fill and friction of its own and is indented
+by finite elements. Each fingertip has several *specimens*, which differ in electrodes, fluid, place
+of the core, noise and warmth ([priors](twin/units.md), `palpate_fem.population.fingertips`).
 
 ## The set
 """
@@ -379,10 +381,10 @@ The same network, learned from {train:,} of these rows (seed {seed}, {epochs} pa
 {count} specimens of fingertips not met, on the same {rows:,} rows for any number of known presses:
 """
 
-BOUNDS = """Bounds of 90 %, learned on presses of one half of these fingertips and tested on the
-other half, then the other way round. So neither the network nor the bound has met specimen or skin.
-Goal: a bound holds in 90 ± 3 %, where each specimen counts the same, and so does each of its
-presses:
+BOUNDS = """Bounds of 90 % were learned on presses of one half of these fingertips and tested on
+the other half, then the other way round. So neither the network nor the bound was learned on the
+tested specimen or its skin. Goal: a bound holds in 90 ± 3 %, where each specimen counts the same,
+and so does each of its presses:
 """
 
 NETWORK = """## One network for all specimens
@@ -399,14 +401,14 @@ Not in the training are:
 
 Rows have at least 0.5 N. The network was trained on one H200, 50 to 60 passes in 1 to 2 minutes.
 
-The first table is without a known press: means over {seeds} seeds, and their range in brackets.
+In the first table no press is known: means over {seeds} seeds, and their range in brackets.
 Each seed leaves out other fingertips; settings were chosen on those of seed 0. The last three
-columns are of the fingertips not met: the network when all electrodes are off by 0.05 of a
-logarithm, as by a fluid that has warmed since the tare (the worse of both signs), and two rivals on
-the same inputs.
+columns are for the fingertips not met: the network when all electrodes are off by 0.05 of a
+logarithm, as with a fluid that has warmed since the tare (the worse of both signs), and two simple
+estimators on the same inputs.
 """
 
-SHOTS = """The second table is with known presses of the finger. *Not met* and the number of known
+SHOTS = """In the second table presses of the finger are known. *Not met* and the number of known
 presses: {specimens} specimens of fingertips not met, {draws} draws of known presses of each, tested
 on presses at other points, none of them in the training; the same {rows:,} rows for any number of
 presses. *Finger met*: specimens that were met, tested on presses that were not. *Ratio*: error on
@@ -416,34 +418,36 @@ network's estimate without a press, times the one factor that fits the known pre
 
 TOLD = """## What it says
 
-* **Ten presses make a finger that was never met as good as one that was**: {force_10:.3f} and
-  {met:.3f} N, a ratio of {ratio:.2f} (goal 1.2). With no press the error is {force_0:.2f} N, as all
-  forces of a finger are too small or too large by one factor; with one press it is {force_1:.2f} N,
-  with five {force_5:.2f} N. One factor fitted to the ten presses leaves {factor:.2f} N. Centre and
-  normal have ratios of {ratio_centre:.2f} and {ratio_normal:.2f}; on the second set all ratios are
-  {ratio_second}.
-* **The network does not read the electrodes at rest.** They would identify a specimen of the
-  training, which the network then knows by heart: known presses no longer help, and a finger that
-  was not met is estimated twice as badly ([LOG](../../training/LOG.md)).
+* **With ten presses, a finger that training has not met is estimated as well as one that it has**:
+  errors of {force_10:.3f} and {met:.3f} N, a ratio of {ratio:.2f} (goal 1.2). Without a press the
+  error is {force_0:.2f} N, because all forces of a finger are too small or too large by one factor;
+  with one press it is {force_1:.2f} N, with five {force_5:.2f} N. If only one factor is fitted to
+  the ten presses, it is {factor:.2f} N. Centre and normal have ratios of {ratio_centre:.2f} and
+  {ratio_normal:.2f}; on the second set all ratios are {ratio_second}.
+* **The electrodes at rest are not an input of the network.** With them it would recognise each
+  specimen of the training: known presses then do not help, and errors on fingers not met are twice
+  as large ([LOG](../../training/LOG.md)).
 * **A new skin is no worse than a new specimen on a known skin**: on specimens not met the force is
   off by {specimen:.2f} N without a press and by {specimen_10:.2f} N with ten.
-* **The place of the contact hardly needs a press**: with ten presses, centre of pressure
-  {centre:.2f} mm and contact normal {normal:.1f} degrees (a constant: {centre_constant:.0f} mm and
-  {normal_constant:.0f} degrees). Ten presses bring the location from {location_0:.2f} to
-  {location_10:.2f} mm (goal 0.8).
-* **From 2 N on the force is bad**: off by {hard:.0f} % with ten presses, by {hard_met:.0f} % on
-  specimens that were met (goal 8). Beside the pad the skin is pinched on the core, and forces grow
-  while electrodes hardly change. Wider networks and more passes learn more presses by heart, and
-  get worse on others; with half as many presses again 31 % become 29 % (LOG).
+* **The place of the contact hardly depends on known presses**: with ten presses, the errors are
+  {centre:.2f} mm for the centre of pressure and {normal:.1f} degrees for the contact normal (a
+  constant: {centre_constant:.0f} mm and {normal_constant:.0f} degrees). Ten presses reduce the
+  error of the location from {location_0:.2f} to {location_10:.2f} mm (goal 0.8).
+* **From 2 N on the force is inaccurate**: off by {hard:.0f} % with ten presses, by {hard_met:.0f} %
+  on specimens that were met (goal 8). Beside the pad the skin is pinched on the core, and forces
+  grow while electrodes hardly change. Wider networks and more passes overfit: they are better on
+  presses of the training and worse on others. With half as many presses again, 31 % become 29 %
+  (LOG).
 * **Bounds hold on specimens and skins that were not met**, once a press is known: for {held_1:.0f}
   % of the forces and {held_location:.0f} % of the locations (nominal 90). Without a press the bound
   of force holds in {held_0:.0f} %, because whole specimens are off by one factor.
-* **A common offset does no harm**: with 0.05 of a logarithm on all electrodes, the force is off by
-  {offset:.2f} N with ten presses.
-* **On real fingers the network does not help** the method for [fingers never met](transfer.md): a
-  quarter of its magnitude makes both fingers worse (LOG). What touched these fingers is not known.
-  A plate explains them as well as any indenter ([fit to a sensor](twin/sensor-fit.md)), but the
-  second set, which has one, comes no nearer to them.\
+* **A common offset hardly matters**: with 0.05 of a logarithm on all electrodes, the force is off
+  by {offset:.2f} N with ten presses.
+* **On real fingers the network does not help** the method for [fingers never met](transfer.md):
+  mixing a quarter of its magnitude into the estimate makes it worse on both fingers (LOG). What
+  touched these fingers is not known. A plate explains their signals as well as any indenter
+  ([fit to a sensor](twin/sensor-fit.md)), but a network of the second set, which contains a plate,
+  is not better on them.\
 """
 
 

@@ -235,8 +235,9 @@ def main(data: Path | None) -> None:
         "",
         "## Two real BioTacs, for which none of these bundles was trained",
         "",
-        f"An estimate is *wrong* if its force is off by more than {WRONG_N:g} N and by more than",
-        f"{WRONG_SHARE:.0%} of the measured force. Always pressed, but for the last column.",
+        f"An estimate counts as *wrong* if its force is off by more than {WRONG_N:g} N and by more",
+        f"than {WRONG_SHARE:.0%} of the measured force. The finger is pressed in all columns but",
+        "the last.",
         "",
         *table(
             results["real_fingers"],

@@ -19,11 +19,11 @@ PAGE = FILE.with_suffix(".md")
 
 HEAD = """# Five readers
 
-Each follows the page that [the index](../README.md) names, by a program: `make readers` pastes the
-commands of the page, in order, into terminals in a fresh folder with a fresh home, installs the
-wheel of `make build` as the page says, answers what is asked as the page says, and looks at what
-came of it. Hardware is played by the emulators that the page starts. What no program stands in for:
-understanding the page, and a view in a window.
+How long a new user needs for the pages that [the index](../README.md) names, and what comes out. A
+program plays each reader: `make readers` pastes the commands of the page, in order, into terminals
+in a fresh folder with a fresh home, installs the wheel of `make build`, answers questions as the
+page says, and checks the result. The emulators that the page starts play the hardware. A program
+cannot show whether a person understands the page, and it does not open views in windows.
 """
 
 

@@ -117,12 +117,13 @@ palpate data generate runs/test --points 2 --angled 2 --seed 13
 palpate data generate runs/random --random 90 --seed 901 --registration-seed 0 --units-each 2
 ```
 
-Columns are of rows with such a force. The 95 % interval is over presses; the constant is the mean
-of these rows, or nothing for skin and electrodes; the paper's is its best, on real sensors (of the
-skin: on its own simulations). The bounds of the first two bundles were learned from `calibrate`,
-`check` and [2,000 presses at random](intervals.md), weights from none of these. The robots of the
-first three sets stand wrong in another way than those of the training, which errors of the location
-include. What each bundle does on presses that its own training held out is on
+The columns from *below 2 N* on are for rows with such a force. The 95 % interval is over presses.
+*Constant* is the error of the mean of these rows, or of zero for skin and electrodes. *Paper* is
+the paper's best result, on real sensors (for the skin: on its own simulations). The bounds of the
+first two bundles were learned from `calibrate`, `check` and
+[2,000 random presses](intervals.md); no weights were learned from these. The robots of the first
+three sets have other registration errors than those of the training; the errors of the location
+include this difference. The errors of each bundle on presses that its own training held out are on
 [its card](../models.md).
 [How they were trained](../twin.md#networks).
 

@@ -31,20 +31,22 @@ HEAD = """\
 <!-- Written by docs/make_study.py from the JSON of docs/results/study; do not edit. -->
 # All systems in one harness: what came out
 
-The pages below have tables, pictures and the numbers behind them. Each names its command:
+How exact our networks and those of the paper and its sources are, all trained and tested on the
+same rows. The pages below have tables, pictures and the numbers behind them. Each names its
+command:
 
 {pages}
-A test of all units in the first split of a task has five seeds, any other test one.{missing} What
-each network costs per frame: [networks.md](networks.md). What failed:
+The tests of all units together in the first split of a task have five seeds, every other test has
+one.{missing} Time of each network per frame: [networks.md](networks.md). What was tried and failed:
 [training/LOG.md](../../training/LOG.md). How it is built: [ADR 22](../adr/0022-one-study.md).
 
 ## Goals
 
 * *Ours*: the mean of three networks.
-* *With gains*: the same, trained with random gains of the electrodes, which stand for fingers that
+* *With gains*: the same, trained with random gains of the electrodes, which imitate fingers that
   were not seen.
 * *Floor*: the same network without gains, tested on rows whose neighbours it was trained on. It is
-  no result; it shows what more presses could give.
+  not a fair test; it shows what more presses could reach.
 * *Ratio*: our median error over that of the best of the paper's three networks in the same test,
   with its 95 % interval.
 
@@ -55,7 +57,7 @@ PAGES = (
         "[twin](study/twin/report.md)",
         "the twin: 450 indentations, three simulated BioTacs",
         "trajectories, executions, points, indenters; a BioTac (without calibration); "
-        "neighbouring rows (no result: the floor)",
+        "neighbouring rows (the floor, not a fair test)",
     ),
     (
         "[real](study/real/report.md)",
@@ -72,7 +74,7 @@ PAGES = (
 MORE = """
 ## With {times} times the presses
 
-The same twin was pressed {others:,} times more, at other points and at random ([how](../twin.md)).
+The same twin was pressed {others:,} times more, at other points and randomly ([how](../twin.md)).
 These trajectories were joined with the paper's experiment (`palpate data join`) and added to its
 training trajectories: `palpate train report --test-part`. Both columns are tested on the same fifth
 of the paper's trajectories. [Few](study/few/report.md) learns from {own} others of the paper's
@@ -82,9 +84,10 @@ trajectories (five seeds), [more](study/more/report.md) also from the {others:,}
 {table}
 * **More presses make the errors smaller**: with them the same networks, with no setting changed,
   reach {reached} of {goals} goals.
-* **With enough presses the network matters less.** For the force from 2 N the paper's PointNet++ is
-  as good as ours (ratio {ratio}), for electrodes nearly so; for angle, location and skin ours stay
-  ahead. The goals for ratios, which were set for few presses, are not reached.
+* **With enough presses the choice of the network matters less.** For the force from 2 N the paper's
+  PointNet++ is as good as ours (ratio {ratio}), and nearly so for electrodes; for angle, location
+  and skin ours are still better. The goals for ratios, which were set for few presses, are not
+  reached.
 """
 
 TAIL = """
@@ -92,24 +95,25 @@ TAIL = """
 
 **Too few presses**, for all tests on the twin. Every error falls with the number of trajectories
 that our networks are trained on, and none levels off ([picture](study/presses.png),
-`python docs/make_learning_curve.py`). The floors are below nearly all goals, so neither noise nor
-labels nor networks prevent them. *Presses needed* extrapolates the slope of the last doubling; in
-fact slopes become flatter: with the presses of the section above, the force was {force_more} off.
-{hard} of the rows are above 8 N.
+`python docs/make_learning_curve.py`). The floors are below nearly all goals, so the goals are not
+prevented by noise, labels or networks. *Presses needed* extrapolates the slope of the last
+doubling; in fact slopes become flatter: with the presses of the section above, the force was
+{force_more} off. {hard} of the rows are above 8 N.
 
 {curve}
 * **The ratios.** Few presses limit the paper's networks, too. On neighbouring rows the ratio is
   {floor_force} for force from 2 N, {floor_angle} for its angle and {floor_location} for location
-  below 2 N, which would meet the goals; with more presses (section above) it is not met.
-* **A BioTac that was not seen.** Random gains in training stand for it. Over all {tests} tests they
+  below 2 N, which would meet the goals. With more presses (section above) the goals are not met.
+* **A BioTac that was not seen.** Random gains in training imitate it. Over all {tests} tests they
   lower the mean error of force from {plain_force} to {gains_force}, and of location from
   {plain_location} to {gains_location}. Attention over electrodes, without gains, has
   {attention_force} and {attention_location}.
-* **A real finger that was seen: its baselines.** Gains do harm there. Without them our networks are
-  as good as the paper's best on unseen blocks (ratios {block1} and {block2}). So the network is not
-  what matters: electrodes drift between touches, and there are only a few minutes of data.
+* **A real finger that was seen: its baselines.** Gains make the errors larger there. Without them
+  our networks are as good as the paper's best on unseen blocks (ratios {block1} and {block2}). So
+  the limit is not the network: electrodes drift between touches, and there are only a few minutes
+  of data.
 * **Electrodes from the skin** are farthest from their goal: where the fluid film closes, its
-  thickness follows the pressure on the core, of which a displacement says little
+  thickness depends on the pressure on the core, which can hardly be read from a displacement
   ([training/LOG.md](../../training/LOG.md)).
 * **Location below 2 N** includes the robot's registration error, one constant for each unit and
   arm, which can only be learned on units that were seen.

@@ -162,7 +162,8 @@ def page(facts: dict[str, Any]) -> str:
     ended += [[rival, *(cell(one[rival]) for one in facts["later"])] for rival in RIVALS]
     return f"""# Force on a real finger that training has not met
 
-Two real BioTacs of the LASA force calibration, always in contact, forces of 0.4 to 10 N. The force
+How exact the force on a real finger is that no network was trained on. There are two real BioTacs,
+those of the LASA force calibration, always in contact, with forces of 0.4 to 10 N. The force
 of each is estimated by what was learned on the other. `python docs/make_transfer.py ../shared/data`
 makes this page. To make one row, use `palpate data ingest-lasa force_calibration.npz 1.h5
 --finger 1`, the same for 2, and `palpate train transfer --train 1.h5 --test 2.h5 --shots 5`.
@@ -176,7 +177,7 @@ stay below [N] / median error of the angle [rad].
 * *Tare only*: the estimate of a row uses the tare and the rows before it.
 * *Unlabelled*: it may also use mean and spread of the electrodes over the whole recording, but no
   force.
-* *Presses*: it may also use so many pieces of 2 s with known forces, drawn at random
+* *Presses*: it may also use this number of pieces of 2 s with known forces, drawn at random
   {facts["draws"]} times. Rows within 1 s of them are not tested.
 * *Constant*: the mean force of the other finger; with presses, that of the labelled rows.
 * *Ridge*: a ridge regression on tared counts, which learns from the same rows.
@@ -200,18 +201,19 @@ Fingers that training has met, at a later time: learned from the first
   What was tried: training/LOG.md.
 * The *twin's line*: the magnitude starts from a linear fit of 20,000 presses of the
   [twin](population.md), 60 numbers; scale and axes of the fit are taken from the other finger. It
-  helps where little is known; no network of the twin did. `palpate calibrate` starts from it, too.
-* A labelled press corrects most the rows within some ten seconds before and after it, because
-  baselines wander. An estimate in real time has only the presses before it, so it gains less.
+  helps where few presses are known; no network of the twin helped. `palpate calibrate` starts from
+  it, too.
+* A labelled press mainly corrects the rows within some ten seconds before and after it, because
+  baselines drift. An estimate in real time has only the presses before it, so it gains less.
 * A finger's own first minute alone is worse than the other finger and five presses drawn from the
-  whole recording: baselines wander, and these fingers are never released to be tared again.
+  whole recording, because baselines drift and these fingers are never released to be tared again.
 * The constants of the method were chosen on these two fingers, by the worse of the two. So the
-  numbers are somewhat too good; a third finger would be a test.
+  numbers are somewhat too good; only a third finger would be an independent test.
 * A single press makes the magnitude of the first finger worse. From two presses on, a ridge
-  regression that is corrected in the same way is mixed in; presses that are left out decide its
-  share. Magnitudes gain by it; the first finger's direction with five presses does not (0.071 rad
-  without it).
-* The errors that are left are mostly slow: baselines that wander within half a minute.
+  regression that is corrected in the same way is mixed in, with a weight that is chosen on presses
+  that are left out. Magnitudes gain by it; the first finger's direction with five presses does not
+  (0.071 rad without it).
+* The remaining errors are mostly slow: baselines drift within half a minute.
 * The intervals are learned from errors between the halves of the other finger's recording, which
   are smaller than those between fingers. The more labelled presses there are, the more the
   intervals rest on these, each estimated without itself.
@@ -254,21 +256,21 @@ def on_simulated_fingers() -> str:
 The constants were chosen on the two real fingers. So the method was also tested on pairs of
 simulated fingers ([commands](../make_transfer_simulated.py)): it learns from one finger and is
 tested on the other. {report["fingers"]} fingers have a skin, fill and electrodes of their own, are
-pressed {report["presses"]} times, and drift as real ones do. Nothing was chosen on them: the rules
-below were found on other simulated fingers and on the real ones (training/LOG.md), whose signals
-differ by a factor of 1.4, so that nothing is scaled.
+pressed {report["presses"]} times, and drift as real ones do. No setting was chosen on them: the
+rules below were found on other simulated fingers and on the real ones (training/LOG.md). The
+signals of the two real ones differ by a factor of 1.4, so the rules scale nothing there.
 
 * *Unlike*: the untouched impedance of one finger is more than twice that of the other. Without a
-  press nothing tells how sensitive such a finger is, so the estimate is the other's mean force.
-* *Alike*: all other pairs. Here the size of the signals tells how sensitive the finger is: signals
+  press the sensitivity of such a finger is not known, so the estimate is the other's mean force.
+* *Alike*: all other pairs. Here the size of the signals shows how sensitive the finger is: signals
   beyond {SAME_USE:g} times those of the other finger are scaled down, those from {SAME_USE**2:g}
   times on to the same size.
 * *Pressed harder*: only the harder half of the presses is in the recording, so that larger signals
   do not mean a more sensitive finger.
 * *New*: pairs with one of {report["new_fingers"]} more fingers, of another draw.
 
-With labelled presses, each is left out in its turn. The error on it tells whether the scale of the
-estimates is wrong, and how much weight a ridge regression gets (on logarithms of impedances,
+With labelled presses, each is left out in turn. The errors on them decide how the estimates are
+scaled, and how much weight a ridge regression gets (on logarithms of impedances,
 learned from the same presses and corrected by them in the same way).
 
 {worse_pairs(report["results"])}
@@ -291,8 +293,8 @@ def worse_pairs(results: list[dict[str, Any]]) -> str:
     return "\n".join(
         [
             "Without a press, a finger whose signals are 1.2 to 1.5 times as large may be",
-            "estimated far worse than by a constant: a more sensitive finger and one that is",
-            "pressed harder look the same. Five presses tell them apart:",
+            "estimated far worse than by a constant, because a more sensitive finger and one that",
+            "is pressed harder look the same. With five presses they can be distinguished:",
             "",
             *lines,
         ]

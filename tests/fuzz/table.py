@@ -10,12 +10,12 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "fuzz.md"
 
 _HEAD = """# The decoders under a fuzzer
 
-What the last run of `make fuzz DECODER=NAME SECONDS=600` did to each decoder, and of how many
-inputs its corpus is since: `tests/fuzz/corpus/`, which `tests/fuzz/test_corpus.py` plays on every
-test run. A target breaks if a decoder raises, keeps too much, takes different records out of the
-same bytes cut differently, leaves a byte unaccounted, or does not find the next good frame
-(`tests/fuzz/targets/`). Seconds are CPU time of the fuzzer; branches and features are libFuzzer's
-`cov` and `ft`.
+Result of the last run of `make fuzz DECODER=NAME SECONDS=600` for each decoder, and the size of
+its corpus since then (`tests/fuzz/corpus/`, which `tests/fuzz/test_corpus.py` plays on every test
+run). A target fails if a decoder raises an exception, keeps too much, finds different records in
+the same bytes when they are cut differently, does not count a byte, or does not find the next good
+frame (`tests/fuzz/targets/`). Seconds are CPU time of the fuzzer; branches and features are
+libFuzzer's `cov` and `ft`.
 
 | Decoder | Seconds | Executions | Branches | Features | Corpus: inputs | bytes | Crashes |
 |---|---|---|---|---|---|---|---|
