@@ -68,6 +68,7 @@ class Health:
         self._lock = threading.Lock()
         self._counters: Counter[str] = Counter()
         self._gauges: dict[str, float] = {}
+        self._sources: dict[str, frozenset[str]] = {}
         self._state = ServiceState.STARTING
         self._message = self._state_message = ""
         self._last_error: ErrorReply | None = None
@@ -142,6 +143,14 @@ class Health:
         """Set a gauge; its name ends in the unit."""
         with self._lock:
             self._gauges[name] = value
+
+    def set_gauges(self, source: str, gauges: Mapping[str, float]) -> None:
+        """Set all gauges of a source, e.g. a sensor; those that it had and has no more are gone."""
+        with self._lock:
+            for name in self._sources.get(source, frozenset()) - gauges.keys():
+                self._gauges.pop(name, None)
+            self._sources[source] = frozenset(gauges)
+            self._gauges.update(gauges)
 
     def fail(self, error: PalpateError, *, degraded: bool = True) -> None:
         """Remember the last error; by default the state becomes DEGRADED."""

@@ -7,13 +7,16 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from palpate.bus.topics import SCHEMAS
 from palpate.config import LinkConfig
 from palpate.errors import RecordingError
 from palpate.files.record import read_record
+from palpate.files.record_writer import RecordWriter
 from palpate_deploy.demo.bundles import write_virtual_record
 from palpate_deploy.diagnose import records
 
@@ -23,14 +26,36 @@ Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 def test_info_counts_streams(palpate: Palpate, virtual_record: Path) -> None:
     result = palpate("info", virtual_record, "--json")
     assert result.returncode == 0
-    counts = {key.rpartition("/")[2]: n for key, n in json.loads(result.stdout)["counts"].items()}
+    told = json.loads(result.stdout)
+    counts = {key.rpartition("/")[2]: n for key, n in told["counts"].items()}
     assert counts == {"electrodes": 300, "wrench": 300, "pose": 300, "tare": 1}
+    rates = {key.rpartition("/")[2]: round(hz) for key, hz in told["rates_hz"].items()}
+    assert rates == {"electrodes": 100, "wrench": 100, "pose": 100}
 
 
 def test_info_table(palpate: Palpate, virtual_record: Path) -> None:
     result = palpate("info", virtual_record)
     assert result.returncode == 0
     assert "finger/electrodes" in result.stdout
+    assert "wall clock" not in result.stdout
+
+
+def test_info_says_that_the_wall_clock_was_set(
+    virtual_record: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "set.mcap"
+    with RecordWriter(path) as writer:
+        for i, item in enumerate(read_record(virtual_record)):
+            codec = SCHEMAS[item.schema]
+            message = codec.decode(item.payload)
+            ahead_ns = 60 * 10**9 if i > 400 else 0
+            stamp = replace(message.stamp, wall_ns=message.stamp.wall_ns + ahead_ns)
+            payload = codec.encode(replace(message, stamp=stamp))
+            writer.write(item.key, item.schema, payload, log_time_ns=item.log_time_ns + ahead_ns)
+    records.print_contents(path)
+    shown = capsys.readouterr().out
+    assert "the wall clock was set by +60.0 s" in shown
+    assert "100.00" in shown
 
 
 def test_truncated_record_is_refused_and_recovered(

@@ -31,7 +31,9 @@ from palpate.messages import (
 from palpate_deploy.station import observation
 from palpate_deploy.station.activity import DropCount, process_activities, sensor_activities
 from palpate_deploy.station.observation import ObservedProcess, StationObserver
+from palpate_deploy.station.status import shown_counters
 from palpate_deploy.station.top import run_top, screen
+from palpate_services.inference.estimates import EstimateRefusal
 
 PATIENCE_S = 20.0
 
@@ -68,7 +70,7 @@ GATEWAY = Status(
     {"thumb.frames_published": 500, "thumb.silences": 3, "ring.frames_published": 400},
     {"thumb.tare_age_s": 61.0, "thumb.publish_p50_s": 3e-4, "ring.tare_drift_counts": 7.0},
     sensor_states=(
-        SensorStatus("thumb", SensorState.LIVE, 4 * 10**11),
+        SensorStatus("thumb", SensorState.LIVE, 4 * 10**11, (), "E7 has drifted: tare again"),
         SensorStatus("ring", SensorState.LOST, 9 * 10**11, (), "silent for 40 ms"),
     ),
 )
@@ -121,6 +123,26 @@ def test_figures_of_every_process() -> None:
     assert (router.state, router.uses.rss_bytes, router.pid) == ("routes", 7e7, 4700)
 
 
+LOSSES = (
+    *(one.value for one in EstimateRefusal if one is not EstimateRefusal.SKIPPED_RATE),
+    "sensors_refused", "unpublishable_location", "asked_no_model", "tares_refused",
+    "dropped_newest_wins", "overflow", "lost_on_bus", "reordered", "other_session", "unannounced",
+    "rejected_names", "lost_disk_full", "invalid_parse", "lost_with_record", "disk_failures",
+    "missing_frames", "frames_rejected", "silences", "device_lost", "invalid_samples",
+)  # fmt: skip
+"""Counters of what is lost, refused or not delivered, of every service."""
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_every_reason_of_a_loss_is_shown(name: str) -> None:
+    status = dataclasses.replace(FEATURES, counters={name: 7, "received": 9, "skipped_rate": 3})
+    (one,) = process_activities(
+        [ObservedProcess(ProcessReport("features", "features", True, True, status))]
+    )
+    assert one.drops == {name: DropCount(7, 0.0)}
+    assert shown_counters(status) == f"{name} 7"
+
+
 def test_figures_of_every_sensor() -> None:
     thumb, ring = sensor_activities(observed())
     assert (thumb.name, thumb.state, thumb.rate_hz, thumb.tare_age_s) == (
@@ -129,6 +151,7 @@ def test_figures_of_every_sensor() -> None:
         100.0,
         61.0,
     )
+    assert thumb.message == "E7 has drifted: tare again"
     assert thumb.publish.p50_s == 3e-4
     assert thumb.drops == {"silences": DropCount(3, 100.0)}
     assert thumb.state_age_s == pytest.approx(600.0)
@@ -152,7 +175,7 @@ def test_the_picture_shows_all_of_it(width: int) -> None:
         "fem backoff",
         "field silent",
         "router routes",
-        "thumb live 10:00 100 0.3 - 1:01",
+        "thumb live 10:00 100 0.3 - 1:01 - E7 has drifted:",
         "ring lost",
         "p50/p99 ms infer features 0.4/0.9",
         "features lost: stale 10 (+2.0/s)",

@@ -7,7 +7,7 @@ from dataclasses import replace
 from rich.console import Console
 
 from palpate_deploy.station.supervision import ProcessState, recent
-from palpate_deploy.station.up import _print_changes, _table
+from palpate_deploy.station.up import _is_up, _print_changes, _table
 
 FINE = ProcessState("gateway", "RUNNING", 10, 900.0, 0, 0, True, 0, "")
 HUNG = ProcessState("features", "RUNNING", 12, 30.0, 3, 1, True, -9, "hung: no heartbeat for 5.0 s")
@@ -37,3 +37,16 @@ def test_a_log_gets_one_line_a_change() -> None:
             _print_changes(console, [HUNG], before)
     (line,) = shown.get().splitlines()
     assert line.endswith("features: running, pid 12, restart 3 (hung: no heartbeat for 5.0 s)")
+
+
+def test_a_station_is_up_with_its_router_and_something_that_serves() -> None:
+    router = replace(FINE, service="router")
+    starting = replace(FINE, service="features", state="STARTING", uptime_s=3.0)
+    again = replace(starting, restarts=1, pid=0, state="BACKOFF", why="hung")
+    assert _is_up([router, FINE])
+    assert not _is_up([router, FINE, starting]), "its first start may take a while"
+    assert _is_up([router, FINE, again])
+    assert not _is_up([replace(again, service="router"), FINE])
+    assert not _is_up([replace(again, service=name) for name in ("router", "gateway", "features")])
+    assert not _is_up([replace(again, service=name) for name in ("gateway", "features")])
+    assert _is_up([replace(FINE, state="EXITED"), router]), "a recording has come to its end"

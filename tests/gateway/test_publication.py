@@ -45,6 +45,19 @@ def test_latency_from_reading_to_bus() -> None:
     assert len(publisher.payloads) == 7
 
 
+def test_latencies_of_a_sensor_that_delivers_no_more_are_not_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out = message_publisher(Slow(), threading.Event())
+    out.put(DueMessage("x", b"a", 0), read_ns=time.monotonic_ns())
+    assert out.gauges()
+    later_ns = time.monotonic_ns() + 10_000_000_000
+    monkeypatch.setattr(time, "monotonic_ns", lambda: later_ns)
+    assert out.gauges() == {}
+    out.put(DueMessage("x", b"b", 0), read_ns=later_ns)
+    assert out.gauges()
+
+
 def test_latency_begins_with_the_read_not_with_publishing() -> None:
     """Stamping comes before: a gateway that is slow there must show it."""
     out = message_publisher(Slow(), threading.Event())

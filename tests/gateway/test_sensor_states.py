@@ -241,6 +241,16 @@ def test_age_and_drift_of_the_tare_are_gauged(
     assert now.gauges["tare_drift_counts"] < 10.0
 
 
+def test_a_silent_sensor_has_no_latency_and_its_tare_ages(
+    bus: Any, emulator: BiotacBridgeEmulator, served: Callable[..., SensorStatus]
+) -> None:
+    before = bus.until(lambda: (now := bus.status()) and "publish_p50_s" in now.gauges and now)
+    emulator.inject("silence", 30.0)
+    served(lambda one, now: one.state is SensorState.LOST and "publish_p50_s" not in now.gauges)
+    age_s = before.gauges["tare_age_s"]
+    served(lambda one, now: one.state is SensorState.LOST and now.gauges["tare_age_s"] > age_s + 3)
+
+
 def test_a_change_is_told_at_once_not_with_the_next_report(bus: Any) -> None:
     """Reports come once an hour here, so whatever comes meanwhile came by itself."""
     health = Health("gateway", "gateway")

@@ -19,7 +19,7 @@ from palpate.errors import ConfigError, LinkError, MissingExtraError
 from palpate_deploy.cli.app import app
 from palpate_deploy.install import service
 from palpate_deploy.install.ledger import InstallError
-from palpate_deploy.install.plan import InstallOrder, present_version
+from palpate_deploy.install.plan import InstallOrder, present_version, program_of
 from palpate_deploy.install.units import ServicePlan
 from palpate_deploy.station.profile import load_profile
 
@@ -134,6 +134,37 @@ def test_dry_run_shows_what_the_install_would_write_and_what_would_stop_it(
     before = contents(root)
     with pytest.raises(InstallError, match="changed since"):
         service.show_plan(order)
+    assert difference(before, contents(root)) == []
+
+
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        ("prefix", f"palpate lies in {HOME}/venv/bin, "),
+        ("executable", f"palpate's Python lies in {HOME}/python/bin, "),
+    ],
+)
+def test_dry_run_shows_the_files_though_no_service_would_see_palpate(
+    root: Path,
+    profile: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    place: str,
+    told: str,
+) -> None:
+    monkeypatch.setattr(Path, "is_file", lambda path: True)
+    monkeypatch.setattr("sys.prefix", f"{HOME}/venv" if place == "prefix" else "/opt/palpate")
+    monkeypatch.setattr("sys.executable", f"{HOME}/python/bin/python3")
+    order = InstallOrder(str(profile), "", root, "")
+    with pytest.raises(ConfigError, match=told):
+        service.show_plan(order)
+    said = capsys.readouterr().out
+    assert f"# ---- /{UNIT}\n" in said
+    assert f"{program_of(order)} up" in said
+    before = contents(root)
+    with pytest.raises(ConfigError, match=told):
+        service.install(order)
     assert difference(before, contents(root)) == []
 
 

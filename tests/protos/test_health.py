@@ -246,3 +246,15 @@ def test_without_messages_no_report_waits_for_ever(link: LinkConfig) -> None:
         states = session.subscriber(STATUS, delivery=Delivery.QUEUE)
         for _ in range(3):
             states.next(PATIENCE_S)
+
+
+def test_gauges_that_a_source_has_no_more_are_gone() -> None:
+    health = Health("gateway", "gateway")
+    health.gauge("wall_error_s", 0.1)
+    health.set_gauges("thumb", {"thumb.a": 1.0, "thumb.b": 2.0})
+    health.set_gauges("ring", {"ring.a": 3.0})
+    health.set_gauges("thumb", {"thumb.b": 4.0})
+    told = dict(health.status().gauges)
+    assert {k: v for k, v in told.items() if not k.startswith("process_")} == {
+        "wall_error_s": 0.1, "thumb.b": 4.0, "ring.a": 3.0,
+    }  # fmt: skip

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from palpate.codec import ELECTRODE_FRAME, WRENCH_FRAME
 from palpate.errors import RecordingError, WireError
 from palpate.files.record import check_readable, read_record, recover, summarise
 from palpate.files.record_writer import RecordWriter, descriptor_set
+from palpate.messages import Stamp
 
 KEY = sensor_key("lab", "finger", "electrodes")
 
@@ -37,6 +39,13 @@ def write_many(writer: RecordWriter, payload: bytes) -> None:
     for _ in range(10_000):
         writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=1)
     writer.flush()
+
+
+def write_times(path: Path, stamps: list[Stamp], *, log_times_ns: list[int], frame: Any) -> None:
+    with RecordWriter(path) as writer:
+        for stamp, log_time_ns in zip(stamps, log_times_ns, strict=True):
+            payload = ELECTRODE_FRAME.encode(replace(frame, stamp=stamp))
+            writer.write(KEY, ELECTRODE_FRAME.schema, payload, log_time_ns=log_time_ns)
 
 
 @pytest.fixture
@@ -56,6 +65,54 @@ def test_what_is_written_comes_back(tmp_path: Path, payload: bytes) -> None:
     assert summary.metadata["station"] == "lab"
     assert summary.complete
     check_readable(path)
+
+
+@pytest.mark.parametrize("step_s", [0, -3, 3600, -60])
+def test_lengths_and_rates_do_not_follow_the_wall_clock(
+    tmp_path: Path, examples: dict[str, Any], step_s: int
+) -> None:
+    """500 frames at 100 Hz of which the first came in a heap, and a wall clock that is set."""
+    frame, path = examples["ElectrodeFrame"], tmp_path / "run.mcap"
+    began_ns, step_ns = 10**18, step_s * 10**9
+    stamps, log_times_ns = [], []
+    for i in range(501):
+        wall_ns = began_ns + i * 10**7 + (step_ns if i > 250 else 0)
+        stamps.append(
+            replace(frame.stamp, sequence=i + 1, monotonic_ns=10**9 + i * 10**7, wall_ns=wall_ns)
+        )
+        log_times_ns.append(max(wall_ns, began_ns + 10**9) if i <= 250 else wall_ns)
+    write_times(path, stamps, log_times_ns=log_times_ns, frame=frame)
+    summary = summarise(path)
+    assert summary.rates_hz == pytest.approx({KEY: 100.0})
+    assert summary.durations_s == pytest.approx({KEY: 5.0})
+    assert summary.wall_step_s == pytest.approx(step_s)
+
+
+def test_runs_of_a_stream_are_timed_apart(tmp_path: Path, examples: dict[str, Any]) -> None:
+    """After a restart of the host, and of a file that is played again, the clock begins anew."""
+    frame, path = examples["ElectrodeFrame"], tmp_path / "run.mcap"
+    runs = [(1, 10**15), (2, 10**9), (2, 10**9)]
+    stamps = [
+        replace(
+            frame.stamp, clock_id=clock, monotonic_ns=at_ns + i * 10**7, wall_ns=10**18 + i * 10**7
+        )
+        for clock, at_ns in runs
+        for i in range(101)
+    ]
+    write_times(path, stamps, log_times_ns=[10**18] * len(stamps), frame=frame)
+    summary = summarise(path)
+    assert summary.durations_s == pytest.approx({KEY: 3.0})
+    assert summary.rates_hz == pytest.approx({KEY: 100.0})
+
+
+def test_a_message_that_does_not_decode_is_counted_and_not_timed(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.mcap"
+    write(path, b"\xff" * 30, 3)
+    summary = summarise(path)
+    assert summary.counts == {KEY: 3}
+    assert not summary.rates_hz
 
 
 def test_the_embedded_schema_is_enough_to_read_it_without_palpate(

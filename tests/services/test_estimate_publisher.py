@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -41,8 +40,8 @@ class Station:
         self.work_ns = self.tare_ns = self.encode_ns = 0
         self.timings: list[StageTimings] = []
         self.put: list[tuple[str, int]] = []
-        self.counts: Counter[str] = Counter()
         self.gauges: dict[str, float] = {}
+        self.of_estimates: dict[str, float] = {}
         self.sensors: tuple[str, ...] = ()
         self.refused: EstimateRefusal | None = None
         self.batches: list[int] = []
@@ -82,14 +81,11 @@ class Station:
 
             return SimpleNamespace(encode=self.encode, put_payload=put_payload, close=close)
 
-        def count(name: str, by: int = 1) -> None:
-            self.counts[name] += by
-
         session = SimpleNamespace(publisher=publisher, wall_clock_error_s=0.05)
         health = SimpleNamespace(
             worked=lambda: None,
-            count=count,
             gauge=self.gauges.__setitem__,
+            set_gauges=lambda source, gauges: setattr(self, "of_estimates", gauges),
             set_sensors=lambda sensors: setattr(self, "sensors", sensors),
         )
         given: Any = {"bundle": "any", "max_age_s": None, "accept_replayed": True, **config}
@@ -134,9 +130,8 @@ def test_the_first_message_of_each_period_is_answered(station: Station, came: Ca
     for k in range(12):
         publisher.take([came(k, START_NS + 10 * k * MS)])
     publisher.take([came(50, START_NS, sensor="thumb")])
-    publisher.report(last=True)
     assert station.put == [("finger", 0), ("finger", 5), ("finger", 10), ("thumb", 50)]
-    assert station.counts == {
+    assert publisher.counters == {
         "frames_received": 13, "estimates_published": 4, "skipped_rate": 9,
     }  # fmt: skip
     assert station.sensors == ("finger", "thumb")
@@ -150,9 +145,8 @@ def test_a_message_without_an_estimate_leaves_its_period_to_the_next(
     publisher.take([came(1, START_NS)])
     station.refused = None
     publisher.take([came(2, START_NS + MS)])
-    publisher.report(last=True)
     assert station.put == [("finger", 2)]
-    assert station.counts["untared"] == 1
+    assert publisher.counters["untared"] == 1
 
 
 def test_a_rehearsal_has_no_effect(station: Station, came: Came) -> None:
@@ -164,17 +158,15 @@ def test_a_rehearsal_has_no_effect(station: Station, came: Came) -> None:
     publisher.rehearse(refused)
     assert station.batches == [1, 1]
     assert station.put == [("finger", 1)]
-    publisher.report(last=True)
-    assert station.counts == {"frames_received": 1, "estimates_published": 1}
+    assert publisher.counters == {"frames_received": 1, "estimates_published": 1}
 
 
 def test_sensors_of_others_are_not_even_counted(station: Station, came: Came) -> None:
     publisher = station.make(sensors=("finger",))
     publisher.take([came(1, START_NS, sensor="thumb")])
     publisher.take([came(2, START_NS)])
-    publisher.report(last=True)
     assert station.put == [("finger", 2)]
-    assert station.counts["frames_received"] == 1
+    assert publisher.counters["frames_received"] == 1
 
 
 @pytest.mark.parametrize(
@@ -196,7 +188,7 @@ def test_latency_counts_from_the_reading_where_its_clock_is_ours(
     station.now_ns, station.work_ns = START_NS + 3 * MS, MS // 2
     publisher.take([received])
     publisher.report(last=True)
-    assert station.gauges["latency_p50_s"] == pytest.approx(latency_s)
+    assert station.of_estimates["latency_p50_s"] == pytest.approx(latency_s)
 
 
 def test_gauges_are_of_the_last_period(station: Station, came: Came) -> None:
@@ -210,22 +202,20 @@ def test_gauges_are_of_the_last_period(station: Station, came: Came) -> None:
     station.now_ns = START_NS + 1000 * MS
     publisher.report()
     assert station.gauges["busy_ratio"] == pytest.approx(0.1)
-    assert station.gauges["latency_p50_s"] == pytest.approx(0.0505)
-    assert station.gauges["latency_p99_s"] == pytest.approx(0.09901)
-    station.gauges.clear()
+    assert station.of_estimates["latency_p50_s"] == pytest.approx(0.0505)
+    assert station.of_estimates["latency_p99_s"] == pytest.approx(0.09901)
+    assert station.of_estimates["batch_mean_samples"] == 1.0
     publisher.report(last=True)  # no time has passed, and nothing was published
     assert station.gauges == {"busy_ratio": 0.0}
+    assert station.of_estimates == {}, "old numbers are not shown as present ones"
 
 
-def test_counts_are_handed_over_five_times_a_second(station: Station, came: Came) -> None:
+def test_counters_are_as_old_as_the_look_at_them(station: Station, came: Came) -> None:
+    """A rate is a difference of counters by the time between two statuses."""
     publisher = station.make()
-    publisher.take([came(1, START_NS)])
-    for after_ms, received in ((199, 0), (200, 1), (300, 1), (400, 2)):
-        if after_ms == 300:
-            publisher.take([came(2, START_NS)])
-        station.now_ns = START_NS + after_ms * MS
-        publisher.report()
-        assert station.counts["frames_received"] == received
+    for k in range(3):
+        publisher.take([came(k, START_NS)])
+        assert publisher.counters == {"frames_received": k + 1, "estimates_published": k + 1}
 
 
 def test_sensors_of_one_bundle_share_a_run(station: Station, came: Came) -> None:
@@ -248,9 +238,8 @@ def test_a_sensor_without_a_bundle_is_counted(station: Station, came: Came) -> N
     publisher = station.make()
     station.runtimes = {"thumb": None}
     publisher.take([came(1, START_NS, sensor="thumb"), came(2, START_NS)])
-    publisher.report(last=True)
     assert station.put == [("finger", 2)]
-    assert station.counts["no_model"] == 1
+    assert publisher.counters["no_model"] == 1
 
 
 def test_sensors_are_bounded_and_silent_ones_forgotten(
@@ -260,9 +249,8 @@ def test_sensors_are_bounded_and_silent_ones_forgotten(
     publisher = station.make(rate_hz=1.0)
     for n in range(4):
         publisher.take([came(n, START_NS, sensor=f"s{n}")])
-    publisher.report(last=True)
     assert [sensor for sensor, _ in station.put] == ["s0", "s1"]
-    assert station.counts["sensors_refused"] == 2
+    assert publisher.counters["sensors_refused"] == 2
     for minute in (1, 2):  # s1 goes on, s0 is silent
         station.now_ns = START_NS + minute * 60_000 * MS
         publisher.report()

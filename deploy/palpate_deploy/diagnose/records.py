@@ -111,6 +111,9 @@ def show_info(path: Path, *, as_json: bool) -> None:
                 "start_wall_ns": summary.start_wall_ns,
                 "end_wall_ns": summary.end_wall_ns,
                 "counts": dict(summary.counts),
+                "durations_s": dict(summary.durations_s),
+                "rates_hz": dict(summary.rates_hz),
+                "wall_step_s": summary.wall_step_s,
                 "metadata": dict(summary.metadata),
             },
             indent=2,
@@ -127,20 +130,32 @@ def print_contents(path: Path) -> RecordSummary:
     summary = summarise(path)
     if summary.complete:
         check_readable(path)
-    seconds = max(0, summary.end_wall_ns - summary.start_wall_ns) * 1e-9
     began = datetime.fromtimestamp(summary.start_wall_ns * 1e-9, UTC)
     table = Table(title=cell(str(path)), title_justify="left")
     table.add_column("stream", overflow="fold")
     table.add_column("messages", justify="right")
     table.add_column("Hz", justify="right")
+    table.add_column("length", justify="right")
     for key, count in sorted(summary.counts.items()):
-        rate = f"{(count - 1) / seconds:.2f}" if seconds and count > 1 else "-"
-        table.add_row(cell(key), f"{count:,}", rate)
-    table.caption = (
-        f"{path.stat().st_size / 1e6:.2f} MB, from {began:%Y-%m-%d %H:%M:%S} UTC, "
-        f"{duration_text(seconds)}" + ("" if summary.complete else ", cut off: palpate recover")
+        rate, seconds = summary.rates_hz.get(key), summary.durations_s.get(key)
+        table.add_row(
+            cell(key),
+            f"{count:,}",
+            "-" if rate is None else f"{rate:.2f}",
+            "-" if seconds is None else duration_text(seconds),
+        )
+    table.caption = f"{path.stat().st_size / 1e6:.2f} MB, from {began:%Y-%m-%d %H:%M:%S} UTC" + (
+        "" if summary.complete else ", cut off: palpate recover"
     )
-    Console().print(table)
+    console = Console()
+    console.print(table)
+    if summary.wall_step_s:
+        console.print(
+            f"the wall clock was set by {summary.wall_step_s:+.1f} s in this record: times of day "
+            "before and after do not compare; rates and lengths are by the monotonic clock",
+            style="yellow",
+            soft_wrap=True,
+        )
     return summary
 
 

@@ -126,10 +126,15 @@ def _check_folders(profile: profiles.Profile, state: PurePosixPath) -> None:
 
 
 def program_of(order: InstallOrder) -> str:
-    """The `palpate` command that the units run.
+    """The `palpate` command that the units run."""
+    return order.program or str(Path(sys.prefix) / "bin" / "palpate")
+
+
+def check_program(order: InstallOrder) -> None:
+    """Check that a service can run the `palpate` command of its units.
 
     Raises:
-        ConfigError: There is none that a service can run.
+        ConfigError: It cannot.
     """
     if order.program:
         if not order.program.startswith("/") or _UNPLAIN & set(order.program):
@@ -137,17 +142,19 @@ def program_of(order: InstallOrder) -> str:
                 f"program {order.program!r} is not the plain path of a command",
                 remedy="name it as that system sees it, e.g. /opt/palpate/bin/palpate",
             )
-        return order.program
-    program = Path(sys.prefix) / "bin" / "palpate"
+        return
+    program = Path(program_of(order))
     if not program.is_file() or _UNPLAIN & set(str(program)):
         raise ConfigError(
             f"{program} is no command that a unit can run",
             remedy="install palpate into /opt/palpate, a virtual environment, and run that one",
         )
-    for place in (program, Path(sys.executable).resolve(), Path(__file__)):
+    python = Path(sys.executable).resolve()
+    for what, place in (("", program), ("'s Python", python), ("'s code", Path(__file__))):
         if hidden(place):
             raise ConfigError(
-                f"palpate lies in {place.parent}, and a service does not see {UNSEEN_FOLDERS}",
-                remedy="install it into /opt/palpate and run that one: /opt/palpate/bin/palpate",
+                f"palpate{what} lies in {place.parent}, and a service does not see "
+                f"{UNSEEN_FOLDERS}",
+                remedy="install it into /opt/palpate, an environment of the system's Python, and "
+                "run that one: /opt/palpate/bin/palpate",
             )
-    return str(program)

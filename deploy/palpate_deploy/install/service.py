@@ -28,6 +28,7 @@ from palpate_deploy.install.ledger import (
 )
 from palpate_deploy.install.plan import (
     InstallOrder,
+    check_program,
     checked_name,
     make_plan,
     present_version,
@@ -66,6 +67,7 @@ def show_plan(order: InstallOrder) -> None:
         order, plan, texts = _planned(order, old)
         for path, text in texts.items():
             print(f"# ---- {path}\n{text}")
+        check_program(order)
         if unknown:
             print(f"not compared with what is installed: {unknown}", file=sys.stderr)
         else:
@@ -82,6 +84,7 @@ def install(order: InstallOrder) -> None:
         MissingExtraError: A process needs a package that is not installed.
     """
     _check_rights(order.root)
+    check_program(order)
     with _errors_translated(), Host(order.root).locked() as host:
         books = _open(host, order.station)
         old = books.read()

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from palpate.census import ROUTER
-from palpate.messages import SensorState, SensorStatus, Status, SupervisedProcess
+from palpate.messages import SensorStatus, Status, SupervisedProcess
 from palpate_deploy.station.observation import ObservedProcess
 from palpate_deploy.station.status import TROUBLE
 
@@ -95,7 +95,7 @@ class SensorActivity:
         publish: From the arrival of a reading to its message on the bus.
         tare_age_s: Age of the tare in force [s]; None = there is none.
         tare_drift_counts: Drift of the worst electrode when last untouched [counts].
-        message: What is wrong, for people.
+        message: What is wrong or to be done, for people; a live sensor may have to be tared.
     """
 
     name: str
@@ -231,7 +231,7 @@ def _sensor(observed: ObservedProcess, status: Status, sensor: SensorStatus) -> 
         _latencies(gauges.items()).get("publish", StageLatency()),
         gauges.get("tare_age_s"),
         gauges.get("tare_drift_counts"),
-        "" if sensor.state is SensorState.LIVE and not sensor.faults else sensor.message,
+        sensor.message,
     )
 
 

@@ -23,12 +23,11 @@ from palpate_deploy.station.activity import (
     sensor_activities,
 )
 from palpate_deploy.station.logs import FAILED, cell
-from palpate_deploy.station.observation import StationObserver
+from palpate_deploy.station.observation import RATES_S, StationObserver
 from palpate_deploy.station.status import duration_text
 from palpate_deploy.station.troubles import Trouble, process_name, troubles
 
 _ASK_S = 2.0
-_RATES_S = 1.3  # two statuses of every process
 _STATIONS_MOST = 256
 
 
@@ -67,7 +66,7 @@ def show_fleet(link: LinkConfig, *, as_json: bool) -> int:
 
 
 def look_at_fleet(link: LinkConfig) -> list[StationSummary]:
-    """Every station with a living process, by name; takes two to four seconds.
+    """Every station with a living process, by name; takes three to six seconds.
 
     Raises:
         LinkError: There is no router.
@@ -84,7 +83,7 @@ def look_at_fleet(link: LinkConfig) -> list[StationSummary]:
         }
         for asked in [pool.submit(one.ask, _ASK_S) for one in observers.values()]:
             asked.result()
-        time.sleep(_RATES_S)
+        time.sleep(RATES_S)
         return [_summary(name, sessions[name], observers[name]) for name in names]
 
 

@@ -18,8 +18,8 @@ from palpate.process import Closing
 SILENT_S = 4.0
 """A process publishes its status each second; one that has not for so long does not answer [s]."""
 
-_RATE_S = 3.0
-"""Rates are means over about this long [s]."""
+RATES_S = 3.0
+"""Rates are means over about this long [s]; a single look waits for it."""
 
 _FORGOTTEN_S = 60.0
 _PROCESSES_MOST = 256
@@ -55,7 +55,7 @@ class _Heard:
             self._looks.clear()
         self.status = status
         self._looks.append(status)
-        since_ns = status.monotonic_ns - round(1e9 * _RATE_S)
+        since_ns = status.monotonic_ns - round(1e9 * RATES_S)
         while len(self._looks) > 2 and self._looks[1].monotonic_ns <= since_ns:
             self._looks.popleft()
 

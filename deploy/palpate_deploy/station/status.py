@@ -123,7 +123,8 @@ _SHOWN_COUNTERS = (
 )
 TROUBLE = (
     "lost", "missed", "missing", "dropped", "overflow", "rejected", "stale", "unknown", "failed",
-    "wrong", "silences", "stuck", "dead", "untared",
+    "wrong", "silences", "stuck", "dead", "untared", "invalid", "no_model", "refused", "skew",
+    "finite", "unpublishable", "reordered", "other_session", "unannounced", "failures",
 )  # fmt: skip
 """Parts of the names of counters that count what went wrong."""
 

@@ -30,7 +30,7 @@ from palpate_deploy.station.activity import (
     sensor_activities,
 )
 from palpate_deploy.station.logs import FAILED, cell
-from palpate_deploy.station.observation import ObservedProcess, StationObserver
+from palpate_deploy.station.observation import RATES_S, ObservedProcess, StationObserver
 from palpate_deploy.station.status import duration_text, nothing_runs
 from palpate_deploy.station.troubles import (
     Trouble,
@@ -41,7 +41,6 @@ from palpate_deploy.station.troubles import (
 )
 
 _ASK_S = 2.0
-_RATES_S = 1.3  # two statuses of every process
 _WIDE = 110
 _QUIT = frozenset("qQ\x03\x1b")
 
@@ -85,7 +84,7 @@ def run_top(
     ):
         observer.ask(_ASK_S)
         if once or as_json or not console.is_terminal:
-            time.sleep(_RATES_S)
+            time.sleep(RATES_S)
             observed = observer.look()
             if as_json:
                 print(json.dumps(_as_json(station, observed), indent=2))

@@ -145,8 +145,7 @@ class _Screen:
     def _tell(self, processes: list[ProcessState]) -> None:
         """Tell systemd that the station is up, and alive."""
         running = sum(process.state == "RUNNING" for process in processes)
-        # One that comes and goes must not keep the others from being up.
-        if not self._up and all(p.state in _STARTED or p.restarts for p in processes):
+        if not self._up and _is_up(processes):
             self._up = True
             absent = [f"{p.service} ({p.why})" for p in processes if p.state not in _STARTED]
             without = f" without {', '.join(absent)}" if absent else ""
@@ -171,6 +170,17 @@ class _Screen:
                     self._console.print(f"gateway: {_last_words(self._known)}", markup=False)
                 return process.exit_status
         return None
+
+
+def _is_up(processes: Sequence[ProcessState]) -> bool:
+    """Whether every process has started once, and what can serve does."""
+    absent = [one for one in processes if one.state not in _STARTED]
+    # One that comes and goes must not keep the others from being up; none serves without a router.
+    return (
+        all(one.restarts for one in absent)
+        and len(absent) < len(processes)
+        and all(one.service != ROUTER[0] for one in absent)
+    )
 
 
 def _last_words(known: dict[str, tuple[Status, float]]) -> str:

@@ -9,6 +9,7 @@ little, whereas a press changes some electrodes, and the pressure much.
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from dataclasses import dataclass
 from enum import Enum
@@ -16,7 +17,8 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from palpate.messages import ChannelFault, ElectrodeFrame, FaultKind, FrameLayout, Tare
+from palpate import clock
+from palpate.messages import ChannelFault, ElectrodeFrame, FaultKind, FrameLayout, Stamp, Tare
 from palpate_gateway.condition.channel_health import ChannelHealth, describe
 from palpate_gateway.condition.stillness import (
     WINDOW_BLOCKS,
@@ -234,7 +236,7 @@ class Condition:
         self.warm_up = WarmUp()
         self._untouched_since_s: float | None = None
         self._now_s = 0.0
-        self._tared_s: float | None = None
+        self._tared: Stamp | None = None
         self._gauges: dict[str, float] = {}
         self.motion = "not enough frames yet"
         """Why the sensor does not count as still; empty = it is still."""
@@ -276,7 +278,13 @@ class Condition:
 
     def gauges(self) -> dict[str, float]:
         """Present values; may be called from any thread."""
-        return dict(self._gauges)
+        gauges = dict(self._gauges)
+        if (tared := self._tared) is not None:
+            # A tare ages while no frame comes, too; in a file's time the frames say what is now.
+            live = tared.clock_id == clock.CLOCK_ID
+            now_s = time.monotonic() if live else self._now_s
+            gauges["tare_age_s"] = max(now_s - tared.monotonic_ns * 1e-9, 0.0)
+        return gauges
 
     def begin(self, *, exchanged: bool = False) -> None:
         """The device was opened, or opened again: what happened in between is unknown.
@@ -294,7 +302,7 @@ class Condition:
     def tared(self, tare: Tare) -> None:
         """A tare was taken; its time is that of its last frame."""
         self.level.tared(tare)
-        self._tared_s = tare.stamp.monotonic_ns * 1e-9
+        self._tared = tare.stamp
         self._untouched_since_s = None
         self._tell()
 
@@ -353,7 +361,6 @@ class Condition:
         gauges["warm_up"] = float(self.warm_up.warming)
         if self.warm_up.slope_counts_per_min is not None:
             gauges["tdc_slope_counts_per_min"] = self.warm_up.slope_counts_per_min
-        if self._tared_s is not None:
-            gauges["tare_age_s"] = max(self._now_s - self._tared_s, 0.0)
+        if self._tared is not None:
             gauges["tare_drift_counts"] = self.level.drift_counts
         self._gauges = gauges

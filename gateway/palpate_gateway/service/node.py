@@ -246,8 +246,8 @@ def _refresh(health: Health, workers: list[SensorWorker], wall: WallClock) -> No
     for worker in workers:
         prefix = f"{worker.name}." if len(workers) > 1 else ""
         health.set_counts({prefix + name: value for name, value in worker.counters().items()})
-        for name, measured in worker.gauges().items():
-            health.gauge(prefix + name, measured)
+        gauges = {prefix + name: measured for name, measured in worker.gauges().items()}
+        health.set_gauges(worker.name, gauges)
     wall.look()
     health.set_counts({"wall_steps": wall.steps})
     kept = wall_discipline()

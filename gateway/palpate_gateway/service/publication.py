@@ -35,6 +35,9 @@ this one goes on, which then judges the sensor's condition for a while."""
 _KEPT = 512
 """Number of messages whose latencies are kept."""
 
+_PRESENT_NS = 2_000_000_000
+"""Latencies after which nothing came for longer are past [ns], and told no more."""
+
 
 class MessagePublisher:
     """Publishes the messages of a pipeline.
@@ -70,6 +73,7 @@ class MessagePublisher:
         self._name = name
         self._reasons: set[str] = set()
         self._latencies_ns: deque[int] = deque(maxlen=_KEPT)
+        self._timed_ns = 0
         self._last: tuple[Publisher[Any], Any] | None = None
 
     @property
@@ -80,10 +84,10 @@ class MessagePublisher:
     def gauges(self) -> dict[str, float]:
         """Median and 99 % of the latency from a reading's arrival in this process to the bus [s].
 
-        Stamping and encoding are inside, transport to this process is not.
+        Stamping and encoding are inside, transport to this process is not. Empty while none comes.
         """
         latencies_ns = list(self._latencies_ns)
-        if not latencies_ns:
+        if not latencies_ns or time.monotonic_ns() - self._timed_ns > _PRESENT_NS:
             return {}
         p50, p99 = np.percentile(latencies_ns, (50, 99)) * 1e-9
         return {"publish_p50_s": float(p50), "publish_p99_s": float(p99)}
@@ -115,7 +119,8 @@ class MessagePublisher:
             self._report_once(error, message)
         # A recorded message waits until it is due: its latency would be that of the recording.
         if read_ns and not item.due_ns:
-            self._latencies_ns.append(time.monotonic_ns() - read_ns)
+            self._timed_ns = time.monotonic_ns()
+            self._latencies_ns.append(self._timed_ns - read_ns)
         if isinstance(message, Tare):
             tared = about(self._name, message.stamp, tare_id=message.tare_id)
             _log.info("sensor %s is tared", self._name, extra=tared)

@@ -9,7 +9,9 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from google.protobuf.message import DecodeError
 from mcap.records import Channel, Metadata, Schema
 
 from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, StreamAddress, parse_key
@@ -25,6 +27,10 @@ from palpate.files.mcap_stream import (
     parts_of,
 )
 from palpate.files.record_writer import METADATA, RecordWriter
+from palpate.messages import Origin
+
+_WALL_STEP_NS = 100_000_000
+"""A smaller step of the wall clock is not told [ns]: no time that is shown changes by it."""
 
 DAMAGED_ENDING = ".damaged"
 """Of a record from which all that could be read was recovered: ``NAME.mcap.damaged``."""
@@ -202,6 +208,11 @@ class RecordSummary:
     Attributes:
         metadata: Facts written at its start.
         counts: Messages by key.
+        durations_s: From the first to the last message by key, by the monotonic clock that stamped
+            them [s]; a key without such stamps is missing.
+        rates_hz: Messages a second by key, by the same clock [Hz]; missing = not known.
+        wall_step_s: By how much the wall clock was set meanwhile, the largest time [s]; 0 = it was
+            not.
         start_wall_ns: First log time [ns].
         end_wall_ns: Last log time [ns].
         complete: Whether it was closed whole.
@@ -209,6 +220,9 @@ class RecordSummary:
 
     metadata: Mapping[str, str] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
+    durations_s: Mapping[str, float] = field(default_factory=dict)
+    rates_hz: Mapping[str, float] = field(default_factory=dict)
+    wall_step_s: float = 0.0
     start_wall_ns: int = 0
     end_wall_ns: int = 0
     complete: bool = True
@@ -222,12 +236,66 @@ def summarise(path: Path) -> RecordSummary:
     """
     complete = path.suffix != ".part"
     counts: Counter[str] = Counter()
+    times = _StampTimes()
     start = end = 0
     for item in read_record(path, allow_partial=not complete):
         counts[item.key] += 1
+        times.take(item)
         start = start or item.log_time_ns
         end = item.log_time_ns
-    return RecordSummary(metadata_of(path), counts, start, end, complete)
+    return RecordSummary(
+        metadata_of(path),
+        counts,
+        {key: 1e-9 * span for key, span in times.spans_ns.items()},
+        {key: 1e9 * times.intervals[key] / span for key, span in times.spans_ns.items() if span},
+        1e-9 * times.wall_step_ns,
+        start,
+        end,
+        complete,
+    )
+
+
+class _StampTimes:
+    """How long streams are, by the monotonic stamps of their messages.
+
+    Log times are of a wall clock, which may be set, and of arrival, which a busy host delays.
+
+    Attributes:
+        spans_ns: Time between messages that follow one another, summed by key [ns].
+        intervals: How many such pairs there are, by key.
+        wall_step_ns: The largest step of the wall clock against the stamps [ns].
+    """
+
+    def __init__(self) -> None:
+        self.spans_ns: Counter[str] = Counter()
+        self.intervals: Counter[str] = Counter()
+        self.wall_step_ns = 0
+        self._last: dict[tuple[str, int], tuple[int, int]] = {}
+
+    def take(self, item: RecordItem) -> None:
+        """Take up a message; one that does not decode, or has no stamp, says nothing."""
+        try:
+            message: Any = SCHEMAS[item.schema].message_type.FromString(item.payload)
+        except DecodeError:
+            return
+        stamp = getattr(message, "stamp", None) or getattr(message, "source", message)
+        # A status and a robot's pose have no stamp, but times of one clock.
+        clock_id = getattr(stamp, "clock_id", getattr(stamp, "run_id", 0))
+        now_ns = getattr(stamp, "monotonic_ns", getattr(stamp, "time_ns", 0))
+        if not now_ns:
+            return
+        stream = item.key, clock_id
+        last_ns, last_wall_ns = self._last.get(stream, (0, 0))
+        self._last[stream] = now_ns, stamp.wall_ns
+        if not last_ns or now_ns < last_ns:  # of a file that is played again
+            return
+        self.spans_ns[item.key] += now_ns - last_ns
+        self.intervals[item.key] += 1
+        # In a replay the wall clock is that of the file, and a pose may come without.
+        if getattr(stamp, "origin", Origin.REPLAYED) != Origin.REPLAYED:
+            step_ns = (stamp.wall_ns - last_wall_ns) - (now_ns - last_ns)
+            if abs(step_ns) > max(abs(self.wall_step_ns), _WALL_STEP_NS):
+                self.wall_step_ns = step_ns
 
 
 def metadata_of(path: Path) -> dict[str, str]:

@@ -52,7 +52,7 @@ Prepare = Callable[[Session, ServedModels, Health], Estimation[M, E]]
 SENSORS_MOST = 256
 """Sensors that one service answers; messages of more are counted as ``sensors_refused``."""
 
-_COUNT_PERIOD_NS = 200_000_000
+_TELL_PERIOD_NS = 200_000_000
 _GAUGE_PERIOD_NS = 1_000_000_000
 _FORGET_NS = 60_000_000_000  # a sensor that got no estimate for so long is forgotten
 _WAIT_S = 0.1  # how long a bus without messages delays the next look at the stop event
@@ -185,7 +185,7 @@ def arrival_age_s(stamp: Stamp, arrived_ns: int) -> float | None:
 class EstimatePublisher(Generic[M, E]):
     """Publishes an estimate for each message, or counts why there is none. Use from one thread.
 
-    ``health`` gets counters and gauges; ``models`` are the bundles and ``estimation`` how they are
+    ``health`` gets gauges and troubles; ``models`` are the bundles and ``estimation`` how they are
     used; ``rate_hz`` limits the estimates a second and sensor [Hz], None = no limit. ``duty`` says
     which sensors it publishes for, and for which it stands by; None = all.
     """
@@ -222,7 +222,7 @@ class EstimatePublisher(Generic[M, E]):
         self._latencies_ns: list[int] = []
         self._busy_ns = 0
         self._batches = self._batched = 0
-        self._counted_ns = self._gauged_ns = self._forgot_ns = time.monotonic_ns()
+        self._told_ns = self._gauged_ns = self._forgot_ns = time.monotonic_ns()
 
     def take(self, messages: Sequence[ReceivedMessage[M]]) -> None:
         """Publish the estimates of messages, or count why there are none.
@@ -365,16 +365,17 @@ class EstimatePublisher(Generic[M, E]):
             self._health.set_sensors(tuple(sorted(self._publishers)))
         self._used.clear()
 
+    @property
+    def counters(self) -> dict[str, int]:
+        """What became of the messages, since the start; from any thread."""
+        return dict(self._counts)
+
     def report(self, *, last: bool = False) -> None:
-        """Hand counters and gauges to health at their own periods; with ``last`` now."""
+        """Tell health of refusals, and hand it the gauges, at their own periods; ``last`` = now."""
         now_ns = time.monotonic_ns()
-        if last or now_ns - self._counted_ns >= _COUNT_PERIOD_NS:
-            self._counted_ns = now_ns
-            counts, self._counts = self._counts, Counter()
-            for name, count in counts.items():
-                self._health.count(name, count)
-            if not last:
-                self._input.report()
+        if not last and now_ns - self._told_ns >= _TELL_PERIOD_NS:
+            self._told_ns = now_ns
+            self._input.report()
         period_ns = now_ns - self._gauged_ns
         if last or period_ns >= _GAUGE_PERIOD_NS:
             self._gauged_ns = now_ns
@@ -382,19 +383,19 @@ class EstimatePublisher(Generic[M, E]):
             self._busy_ns = 0
             if self._duty is not None and not last:
                 self._duty.report()
+            gauges = self._stages.take()
             if self._latencies_ns:
                 p50, p99 = np.percentile(self._latencies_ns, (50, 99)) * 1e-9
-                self._health.gauge("latency_p50_s", float(p50))
-                self._health.gauge("latency_p99_s", float(p99))
+                gauges["latency_p50_s"], gauges["latency_p99_s"] = float(p50), float(p99)
                 self._latencies_ns = []
-            for name, seconds in self._stages.take().items():
-                self._health.gauge(name, seconds)
+            if self._batches:
+                gauges["batch_mean_samples"] = self._batched / self._batches
+                self._batches = self._batched = 0
+            # Those of a period without estimates are removed: old ones would pass as present.
+            self._health.set_gauges("estimates", gauges)
             if now_ns - self._forgot_ns >= _FORGET_NS:
                 self._forgot_ns = now_ns
                 self._forget_silent()
-            if self._batches:
-                self._health.gauge("batch_mean_samples", self._batched / self._batches)
-                self._batches = self._batched = 0
 
 
 def _without_repetition(
@@ -482,7 +483,7 @@ def serve(
             announced=not (config.sensors or config.unannounced or config.delivery == "every"),
             rehearse=publisher.rehearse,
         )
-        refresh = partial(_refresh, messages, models, health)
+        refresh = partial(_refresh, messages, publisher, models, health)
         with HealthReporter(session, health, refresh=refresh):
             show(models, health)
             avoid_pauses()
@@ -530,8 +531,18 @@ def _longest_wait_s(config: EstimatingConfig) -> float:
     return tare_s + (LOSSLESS_STALL_S if config.delivery == "every" else 0.0)
 
 
-def _refresh(messages: Subscriber[M], models: ServedModels, health: Health) -> None:
-    """Copy what the subscriber counted (drops, losses on the bus), and what is served."""
+def _refresh(
+    messages: Subscriber[M],
+    publisher: EstimatePublisher[M, E],
+    models: ServedModels,
+    health: Health,
+) -> None:
+    """Copy what subscriber and publisher counted, and what is served.
+
+    Rates are differences of counters by the times of two statuses: none may be older than its
+    status.
+    """
+    health.set_counts(publisher.counters)
     health.set_models(models.labels())
     health.gauge("queue_messages", float(messages.waiting))
     if models.problem is not None:

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import importlib
+import time
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 from tests.gateway.pipelines import pushed
 
+from palpate.clock import CLOCK_ID
 from palpate.errors import DeviceError
 from palpate.messages import ElectrodeFrame, FaultKind
 from palpate_gateway.clock.stamps import DueMessage, FileClock
@@ -65,6 +68,17 @@ def test_drift_is_measured_and_the_worst_electrode_named() -> None:
     assert gauges["tare_age_s"] == pytest.approx(1.99, abs=0.011)
     assert made.message == "E7 has drifted from the tare: tare again"
     assert not made.wants_tare, "not unless the rules say so"
+
+
+def test_a_tare_ages_while_no_frame_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, finger = condition(), fakes.Finger()
+    tare = finger.tare()
+    now_s = 1e-9 * tare.stamp.monotonic_ns + 30.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    made.tared(replace(tare, stamp=replace(tare.stamp, clock_id=CLOCK_ID)))
+    assert made.gauges()["tare_age_s"] == pytest.approx(30.0)
+    now_s += 29.0
+    assert made.gauges()["tare_age_s"] == pytest.approx(59.0)
 
 
 def test_it_tares_again_when_untouched_for_long_enough() -> None:
