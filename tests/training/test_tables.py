@@ -74,7 +74,7 @@ def test_a_strangers_table_is_read_by_a_map(data: FeatureDataset, tmp_path: Path
         }
     )
     (tmp_path / "map.toml").write_text(
-        'electrodes = "skin"\nrest_rows = 5\nforce = ["Fx", "Fy", "-up"]\nforce_unit = "mN"\n'
+        'electrodes = "skin"\nrest_rows = 2\nforce = ["Fx", "Fy", "-up"]\nforce_unit = "mN"\n'
         'time = "t"\ngroup = "episode"\n'
     )
     pq.write_table(table, tmp_path / "lab.parquet")
@@ -85,7 +85,7 @@ def test_a_strangers_table_is_read_by_a_map(data: FeatureDataset, tmp_path: Path
     back = open_dataset(tmp_path / "lab.h5")
     np.testing.assert_allclose(back.force, data.force, atol=1e-5)
     np.testing.assert_array_equal(back.electrodes, data.electrodes)
-    np.testing.assert_allclose(back.baseline[0], data.electrodes[:5].mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(back.baseline[0], data.electrodes[:2].mean(axis=0), rtol=1e-6)
     assert back.sensor_names == ("left",)
     assert back.provenance.licence == "CC0"
     assert back.time_ns is not None

@@ -44,6 +44,9 @@ BLOCKS = 20
 PROVENANCE_COLUMNS = ("source", "licence")
 """Columns of a CSV file of ours that say the same in every row."""
 
+REST_FORCE_N = 0.5
+"""A force above it is a touch in rows that are said to be untouched [N]; noise is below."""
+
 LABELS = ("sensor", "group", "block")
 """Keys of a map, and columns of ours, that hold names."""
 
@@ -311,10 +314,9 @@ def dataset_of(
     kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
     arrays = {name: array[kept] for name, array in arrays.items()}
     arrays["electrodes"] = _counts(arrays["electrodes"], np.flatnonzero(kept), source)
-    if "baseline" in arrays:
-        _check_rest(arrays["baseline"], np.flatnonzero(kept), source)
-    else:
-        arrays["baseline"] = _rest(arrays, columns.rest_rows, source)
+    if "baseline" not in arrays:
+        arrays["baseline"] = _rest(arrays, columns.rest_rows, np.flatnonzero(kept), source)
+    _check_rest(arrays["baseline"], np.flatnonzero(kept), source)
     ours = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
     across = columns.groups_across_sensors or ours
     arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
@@ -430,9 +432,16 @@ def _check_rest(rest: Values, rows: npt.NDArray[np.int64], source: Path) -> None
         )
 
 
-def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
-    """Untouched counts of each row: the mean of the first rows of its sensor."""
-    if rows is None:
+def _rest(
+    arrays: Mapping[str, Any], count: int | None, rows: npt.NDArray[np.int64], source: Path
+) -> Values:
+    """Untouched counts of each row: the mean of the first ``count`` rows of its sensor.
+
+    Raises:
+        DatasetError: There are too few, or something touches in one of them; ``rows`` are those of
+            the table.
+    """
+    if count is None:
         raise DatasetError(
             f"{source}: nothing says what the electrodes read untouched",
             remedy="name columns of the rest, or untouched rows at the beginning: rest_rows = 100",
@@ -440,12 +449,25 @@ def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
     rest: Values = np.empty_like(arrays["electrodes"])
     for sensor in np.unique(arrays["sensor"]):
         own = np.flatnonzero(arrays["sensor"] == sensor)
-        if len(own) <= rows:
+        if len(own) <= count:
             raise DatasetError(
-                f"{source}: a sensor has {len(own)} rows, {rows} of them untouched",
+                f"{source}: a sensor has {len(own)} rows, {count} of them untouched",
                 remedy="give fewer untouched rows: rest_rows",
             )
-        rest[own] = arrays["electrodes"][own[:rows]].mean(axis=0)
+        first, force = own[:count], arrays["force"][own]
+        # From the least force: that of a force sensor which was not zeroed is no touch.
+        size = np.linalg.norm(force - force[np.linalg.norm(force, axis=1).argmin()], axis=1)
+        touched = size[:count] > REST_FORCE_N
+        if "in_contact" in arrays:
+            touched |= arrays["in_contact"][first] == 1
+        if touched.any():
+            row = int(touched.argmax())
+            raise DatasetError(
+                f"{source}: row {rows[first[row]]} is one of the {count} untouched ones of its"
+                f" sensor, but something touches in it ({np.linalg.norm(force[row]):.2g} N)",
+                remedy="give fewer untouched rows: rest_rows; or name columns of the rest",
+            )
+        rest[own] = arrays["electrodes"][first].mean(axis=0)
     return rest
 
 
