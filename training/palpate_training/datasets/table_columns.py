@@ -23,6 +23,8 @@ Columns = str | Annotated[list[str], Field(min_length=1)]
 MISSING = np.iinfo(np.int64).min
 """Stands for a time, a label or a truth that a row lacks."""
 
+_TIMES = "numbers, or timestamps with a date"
+
 
 class TableColumns:
     """Columns of a table by name, with errors that say which and where."""
@@ -45,7 +47,7 @@ class TableColumns:
 
     def truths(self, name: str) -> npt.NDArray[np.int64]:
         """1 = true, 0 = false, or ``MISSING``, shape (N,)."""
-        values = self._column(name)
+        values = self._column(name, "true or false, or 1 or 0")
         lacking = np.isnan(values)
         wrong = np.flatnonzero((values != 0.0) & (values != 1.0) & ~lacking)
         if wrong.size:
@@ -56,10 +58,10 @@ class TableColumns:
         """Times [ns] or ``MISSING``, shape (N,); whole numbers and timestamps are not rounded."""
         column = self._found(name)
         if "timestamp" in str(column.type):  # which says its unit itself
-            known = self._cast(name, "timestamp[ns]", "not times from 1678 to 2261", safe=True)
+            known = self._cast(name, "timestamp[ns]", "times from 1678 to 2261", safe=True)
             column, scale = known.cast("int64"), 1.0
         whole = str(column.type).removeprefix("u").startswith("int")
-        values = column.fill_null(0).to_numpy() if whole else self._column(name)
+        values = column.fill_null(0).to_numpy() if whole else self._column(name, _TIMES)
         lacking = column.is_null().to_numpy() if whole else np.isnan(values)
         most = (2**63 - 1) // int(scale)
         wrong = np.flatnonzero(~((values > -most) & (values < most)) & ~lacking)
@@ -78,10 +80,16 @@ class TableColumns:
         """
         if name is None:
             return (else_,), np.zeros(self._table.num_rows, np.int64)
-        words = [
-            "" if value is None or value != value else str(value).strip()
-            for value in self._found(name).to_pylist()
-        ]
+        said = self._found(name).to_pylist()
+        words = ["" if one is None or one != one else str(one).strip() for one in said]
+        first: dict[str, Any] = {}
+        for word, one in zip(words, said, strict=True):
+            if word and first.setdefault(word, one) != one:
+                raise DatasetError(
+                    f"{self._source}: column {name!r} holds {first[word]!r} and {one!r}, which"
+                    " differ in spaces only",
+                    remedy="write one name for one thing, and other names for others",
+                )
         numbers = {word: number for number, word in enumerate(dict.fromkeys(filter(None, words)))}
         if keep and all(re.fullmatch("0|[1-9][0-9]{0,8}", word) for word in numbers):  # int32
             numbers = {word: int(word) for word in numbers}
@@ -100,21 +108,18 @@ class TableColumns:
             )
         return self._table.column(name)
 
-    def _column(self, name: str) -> Values:
+    def _column(self, name: str, wanted: str = "numbers") -> Values:
         """Numbers of one column, shape (N,); a minus before its name turns the sign."""
         plain = name.removeprefix("-") if name not in self._table.column_names else name
-        values = np.asarray(self._cast(plain, "float64", "not numbers").to_numpy(), np.float64)
+        values = np.asarray(self._cast(plain, "float64", wanted).to_numpy(), np.float64)
         return values if plain == name else -values
 
-    def _cast(self, name: str, kind: str, other: str, *, safe: bool = False) -> Any:
+    def _cast(self, name: str, kind: str, wanted: str, *, safe: bool = False) -> Any:
         column = self._found(name)
         try:
             return column.cast(kind, safe=safe)
         except (ValueError, TypeError, NotImplementedError) as error:  # bases of Arrow's errors
-            raise DatasetError(
-                f"{self._source}: column {name!r} holds {column.type}, {other}",
-                remedy="give numbers (for a time also timestamps), or name another column",
-            ) from error
+            raise self._other_type(name, wanted) from error
 
     def _lists(self, name: str, width: int) -> Values:
         column = self._found(name)
@@ -128,10 +133,13 @@ class TableColumns:
         try:
             return np.array(rows, np.float64)
         except (ValueError, TypeError) as error:  # of lists of text, or of lists
-            raise DatasetError(
-                f"{self._source}: column {name!r} holds {column.type}, not lists of numbers",
-                remedy="give numbers (for a time also timestamps), or name another column",
-            ) from error
+            raise self._other_type(name, "lists of numbers") from error
+
+    def _other_type(self, name: str, wanted: str) -> DatasetError:
+        return DatasetError(
+            f"{self._source}: column {name!r} holds {self._found(name).type}, not {wanted}",
+            remedy=f"give {wanted}, or name another column",
+        )
 
     def _wrong(self, name: str, row: int, found: str, wanted: str) -> DatasetError:
         return DatasetError(
