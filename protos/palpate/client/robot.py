@@ -52,7 +52,7 @@ from palpate.config import (
     check_name,
     joining_link,
 )
-from palpate.errors import ConfigError, StaleError, StreamTimeout
+from palpate.errors import ConfigError, LinkError, StaleError, StreamTimeout
 from palpate.messages import (
     ContactDescription,
     ElectrodeFrame,
@@ -131,10 +131,18 @@ class Client(Closing):
         self._unseen: dict[tuple[str, str], Subscriber[Any]] = {}
         self._streams: list[Stream[Any]] = []
         self._publishers: list[RobotPosePublisher] = []
-        self.session = Session.open(
+        self._session = Session.open(
             joining_link(connect, wait_s=timeout_s, tls=tls), station=check_name(name, "station")
         )
+        self._closed = False
         _open.add(self)
+
+    @property
+    def session(self) -> Session:
+        """What the client is connected by."""
+        if self._closed:
+            raise LinkError("the client is closed", remedy="open a new Client")
+        return self._session
 
     def features(self, sensor: str, *, max_age_s: float = 0.05) -> FeatureEstimate:
         """Contact location and force of one finger now.
@@ -343,11 +351,12 @@ class Client(Closing):
             StreamTimeout: None came in time.
         """
         check_process()  # before the lock, which a thread that is not here may hold
+        session = self.session
         check_duration(timeout_s, "timeout_s", most=LONGEST_S)
         key = (FEATURES.name, check_name(sensor, "sensor"))
         with self._lock:
             if key not in self._unseen:
-                self._unseen[key] = self.session.subscriber(FEATURES, sensor=sensor)
+                self._unseen[key] = session.subscriber(FEATURES, sensor=sensor)
         return self._unseen[key].next(timeout_s)
 
     def robot_pose_publisher(self, robot: str) -> RobotPosePublisher:
@@ -460,6 +469,7 @@ class Client(Closing):
         _open.discard(self)
         if is_inherited():
             return
+        self._closed = True
         for publisher in self._publishers:
             publisher.close()
         with self._lock:
@@ -468,7 +478,7 @@ class Client(Closing):
             stream.close()
         for stream in streams:
             stream.wait_for_calls()
-        self.session.close()
+        self._session.close()
 
     def _stream(
         self, topic: Topic[M], sensor: str, max_age_s: float, timeout_s: float | None, depth: int
@@ -491,13 +501,14 @@ class Client(Closing):
 
     def _latest(self, topic: Topic[M], sensor: str, max_age_s: float) -> M:
         check_process()
+        session = self.session
         check_duration(max_age_s, "max_age_s", most=math.inf)
         key = (topic.name, check_name(sensor, "sensor"))
         with self._lock:
             first = key not in self._newest
             if first:
                 self._newest[key] = (
-                    self.session.subscriber(topic, sensor=sensor, delivery=Delivery.NEWEST),
+                    session.subscriber(topic, sensor=sensor, delivery=Delivery.NEWEST),
                     threading.Lock(),
                 )
             subscriber, lock = self._newest[key]
