@@ -587,7 +587,7 @@ def test_an_async_client_streams_asks_and_leaves_the_loop_free(
             assert seen == sorted(set(seen))
             estimate = await robot.features("finger", max_age_s=LIVE_S)
             assert estimate.force.tolist() == examples["FeatureEstimate"].force.tolist()
-            with pytest.raises(LinkError, match="no service answers"):
+            with pytest.raises(LinkError, match="no gateway has a BioTac of this name"):
                 await robot.tare("nobody")
             with pytest.raises(ConfigError):
                 await robot.features("*")

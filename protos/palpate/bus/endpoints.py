@@ -24,6 +24,7 @@ class Endpoint(Generic[Q, R]):
         name: Last chunk of its key.
         doc: One line for people.
         per_service: Whether its key names a service instead of a sensor.
+        device: What a gateway must have under the sensor's name to answer; empty = anything.
     """
 
     name: str
@@ -31,12 +32,23 @@ class Endpoint(Generic[Q, R]):
     reply: Codec[R]
     doc: str
     per_service: bool = False
+    device: str = ""
 
 
 TARE = Endpoint(
-    "tare", codec.TARE_REQUEST, codec.TARE, "tare a BioTac, or look up a tare by its id"
+    "tare",
+    codec.TARE_REQUEST,
+    codec.TARE,
+    "tare a BioTac, or look up a tare by its id",
+    device="BioTac",
 )
-ZERO = Endpoint("zero", codec.WRENCH_ZERO_REQUEST, codec.WRENCH_ZERO, "zero a force/torque sensor")
+ZERO = Endpoint(
+    "zero",
+    codec.WRENCH_ZERO_REQUEST,
+    codec.WRENCH_ZERO,
+    "zero a force/torque sensor",
+    device="force/torque sensor",
+)
 SIMULATE = Endpoint(
     "simulate",
     codec.SIMULATION_REQUEST,
