@@ -87,6 +87,23 @@ def address_of(what: Topic[Any] | Endpoint[Any, Any]) -> str:
     return f"{ROOT}/{{station}}/{{sensor}}/{what.name}"
 
 
+def services_of(what: Topic[Any] | Endpoint[Any, Any]) -> tuple[str, ...]:
+    """The services that a key names; empty = those of every process, or it names none."""
+    return what.services if isinstance(what, Endpoint) else ()
+
+
+def named_address_of(what: Topic[Any] | Endpoint[Any, Any]) -> str:
+    """As ``address_of``, with the services that answer."""
+    services = services_of(what)
+    named = services[0] if len(services) == 1 else f"{{{'|'.join(services)}}}"
+    return address_of(what).replace("{service}", named) if services else address_of(what)
+
+
+def field_name(codec: Codec[Any], name: str) -> str:
+    """Name of a field as text of the page; a ``KeyError`` where the message has no such field."""
+    return f"`{codec.message_type.DESCRIPTOR.fields_by_name[name].name}`"
+
+
 def message_name(codec: Codec[Any]) -> str:
     """Name of a message without its package."""
     return codec.schema.rpartition(".")[2]
@@ -122,16 +139,20 @@ def channel_of(
 ) -> dict[str, Any]:
     """A channel: where messages of some kinds travel, and how."""
     address = address_of(what)
-    parts = re.findall(r"\{(\w+)\}", address)
+    parameters: dict[str, dict[str, Any]] = {
+        part: {"description": PARTS[part]} for part in re.findall(r"\{(\w+)\}", address)
+    }
+    if services := services_of(what):
+        parameters["service"]["enum"] = list(services)
     return {
         "address": address,
         "description": what.doc,
-        "parameters": {part: {"description": PARTS[part]} for part in parts},
+        "parameters": parameters,
         "messages": {
             message_name(one): {"$ref": f"#/components/messages/{message_name(one)}"}
             for one in codecs
         },
-        "x-zenoh": {"key": re.sub(r"\{\w+\}", "*", address), **zenoh},
+        "x-zenoh": {"key": re.sub(r"\{[^}]+\}", "*", named_address_of(what)), **zenoh},
     }
 
 
@@ -261,7 +282,7 @@ def page() -> str:
         return f"`{text}`"
 
     def key(what: Topic[Any] | Endpoint[Any, Any]) -> str:
-        return code(address_of(what))
+        return code(named_address_of(what))
 
     lines = [
         HEAD.format(limit=MAX_PAYLOAD_BYTES),
@@ -289,9 +310,11 @@ def page() -> str:
         "Zenoh queries: the request is the payload, with its encoding. The attachment",
         f"`{attachment_of(1.5).decode()}` says how long the caller waits; without it a service",
         "works on for callers that have left. Each question ends in replies or in one",
-        f"{link(ERROR)}, whose `retry_after_s` says when to ask again. No reply at all means that",
-        "nobody serves the key, or that the reply was larger than a message may be. A question",
-        "about a sensor names one sensor; one to processes may have wildcards.",
+        f"{link(ERROR)}, whose {field_name(ERROR, 'retry_after_ms')} says when to ask again. No",
+        "reply at all means that nobody serves the key, or that the reply was larger than a",
+        "message may be. A question about a sensor names one sensor; one to processes may have",
+        "wildcards. One in place of a service that the key names also reaches other services,",
+        "which refuse what is no request of theirs.",
         "",
         "| key | request | reply | asked by | answered by | meaning |",
         "|---|---|---|---|---|---|",

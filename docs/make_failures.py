@@ -109,6 +109,7 @@ FLAGS = {
 }
 REFUSALS = {
     EstimateRefusal.UNTARED: "Let go and `palpate tare NAME`.",
+    EstimateRefusal.WRONG_TARE: "Ask about the frame's own finger; or tare again.",
     EstimateRefusal.TARE_UNKNOWN: "Start the gateway that took the tare, or tare again.",
     EstimateRefusal.INVALID_CHANNELS: "See the sensor's faults in `palpate status`.",
     EstimateRefusal.WRONG_SENSOR: "Load a bundle of this kind of sensor: `palpate model load`.",

@@ -97,8 +97,15 @@ class RayCluster(Closing):
             known = ConnectionError, ValueError, RuntimeError
             if not isinstance(error, known) and type(error) is not Exception:
                 raise
+            why = str(error).splitlines()[0]
+            if address == "local":
+                raise LinkError(
+                    f"Ray does not start on this host, which may be too busy: {why}",
+                    remedy="leave --ray out: the processes of one host need no cluster; or run it "
+                    "again when the host is less busy",
+                ) from error
             raise LinkError(
-                f"no Ray cluster answers at {address!r}: {str(error).splitlines()[0]}",
+                f"no Ray cluster answers at {address!r}: {why}",
                 remedy="start one (ray start --head), or leave --ray out",
             ) from error
 

@@ -17,8 +17,10 @@ from palpate.config import LinkConfig
 from palpate.errors import RecordingError
 from palpate.files.record import read_record
 from palpate.files.record_writer import RecordWriter
+from palpate.health import Health
 from palpate_deploy.demo.bundles import write_virtual_record
 from palpate_deploy.diagnose import records
+from palpate_services.recorder import service
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -153,3 +155,16 @@ def test_record_says_that_its_folder_was_removed(
         records.record_station(link, "lab", {"out": out, "rrd": False}, duration_s=0)
     remover.join()
     assert any(out.glob("*.mcap"))
+
+
+@pytest.mark.parametrize("counter", ["overflow", "lost_at_stop", "lost_disk_full"])
+def test_record_says_that_messages_are_lost(
+    link: LinkConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, counter: str
+) -> None:
+    def lose(*_: object, health: Health, **__: object) -> None:
+        health.count(counter, 2478)
+
+    monkeypatch.setattr(service, "run_recorder", lose)
+    monkeypatch.setattr(records, "stop_on_signals", threading.Event)
+    with pytest.raises(RecordingError, match=rf"2,478 messages .* not in it \({counter}\)"):
+        records.record_station(link, "lab", {"out": tmp_path}, duration_s=1.0)

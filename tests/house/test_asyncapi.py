@@ -97,6 +97,14 @@ def test_every_stream_and_question_is_in_it_with_its_key_and_quality(
         assert zenoh["congestionControl"] == "DROP"
     for name, endpoint in ENDPOINTS.items():
         channel = channels[f"ask_{name}"]
+        one = endpoint.services[0] if len(endpoint.services) == 1 else "*"
+        assert channel["x-zenoh"]["key"] == (
+            service_key("*", one, "*", endpoint.name)
+            if endpoint.per_service
+            else sensor_key("*", "*", endpoint.name)
+        )
+        told = channel["parameters"].get("service", {}).get("enum", [])
+        assert told == list(endpoint.services)
         assert channel["x-zenoh"]["encoding"] == ENCODING_PREFIX + endpoint.request.schema
         reply = document["operations"][f"ask_{name}"]["reply"]
         answers = {one["$ref"].rpartition("/")[2] for one in reply["messages"]}

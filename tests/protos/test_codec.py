@@ -115,6 +115,7 @@ def test_a_bad_frame_is_refused_on_both_sides(
         ELECTRODE_FRAME.encode(_broken(examples, **changes))
     assert caught.value.reason == reason
     assert named in str(caught.value)
+    assert caught.value.remedy.startswith("correct the value"), "who sends is not another"
     message = frames_pb2.ElectrodeFrame.FromString(
         ELECTRODE_FRAME.encode(examples["ElectrodeFrame"])
     )
@@ -130,6 +131,7 @@ def test_a_bad_frame_is_refused_on_both_sides(
         ELECTRODE_FRAME.decode(message.SerializeToString())
     assert caught.value.reason == reason
     assert named in str(caught.value)
+    assert caught.value.remedy.startswith("the sender breaks contract")
 
 
 def touched(estimate: FeatureEstimate) -> FeatureEstimate:

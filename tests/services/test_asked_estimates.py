@@ -101,11 +101,19 @@ def test_a_fresh_frame_and_a_replayed_one_are_not_stale(
     assert QualityFlag.STALE not in answer.quality
 
 
-def test_a_frame_without_estimate_is_a_typed_error(station: Client, make_frame: Frames) -> None:
-    with pytest.raises(RemoteError) as caught:
-        station.estimate_features("finger", make_frame(60, tare_id=0))
-    assert caught.value.code is ErrorCode.INVALID_REQUEST
-    assert "before any tare" in str(caught.value)
+def test_a_frame_without_estimate_is_a_typed_error(
+    station: Client, make_frame: Frames, make_tare: Tares
+) -> None:
+    """A frame that is not tared, and one of another finger than the tare that it names."""
+    announce(station.session, make_tare())
+    other = dataclasses.replace(make_frame(60), sensor_serial="BT-OTHER")
+    for frame, says in (
+        (make_frame(60, tare_id=0), "before any tare"),
+        (other, "is of another finger than the frame"),
+    ):
+        with pytest.raises(RemoteError, match=says) as caught:
+            station.estimate_features("finger", frame)
+        assert caught.value.code is ErrorCode.INVALID_REQUEST
 
 
 def test_a_stream_says_where_the_time_went(

@@ -68,7 +68,7 @@ def test_no_estimate_from_an_sp(
     frame, tare = make_frame(sensor_type=SP), make_tare(sensor_type=SP)
     assert ask(frame, tare, runtime) is EstimateRefusal.WRONG_SENSOR
     # After a finger was exchanged: the frame is right, its tare is the other finger's.
-    assert ask(make_frame(), tare, runtime) is EstimateRefusal.UNTARED
+    assert ask(make_frame(), tare, runtime) is EstimateRefusal.WRONG_TARE
 
 
 def test_a_bundle_that_claims_an_sp_is_refused(make_bundle: Callable[..., Path]) -> None:

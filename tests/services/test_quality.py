@@ -174,7 +174,7 @@ def test_the_tare_of_another_finger_is_none(
     runtime: Runtime, make_frame: Frames, make_tare: Tares
 ) -> None:
     tare = dataclasses.replace(make_tare(), sensor_serial="BT-OTHER")
-    assert estimate(make_frame(60), tare, runtime) is EstimateRefusal.UNTARED
+    assert estimate(make_frame(60), tare, runtime) is EstimateRefusal.WRONG_TARE
 
 
 def _shipped(name: str) -> Runtime:

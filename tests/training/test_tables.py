@@ -74,7 +74,7 @@ def test_a_strangers_table_is_read_by_a_map(data: FeatureDataset, tmp_path: Path
         }
     )
     (tmp_path / "map.toml").write_text(
-        'electrodes = "skin"\nrest_rows = 5\nforce = ["Fx", "Fy", "-up"]\nforce_unit = "mN"\n'
+        'electrodes = "skin"\nrest_rows = 2\nforce = ["Fx", "Fy", "-up"]\nforce_unit = "mN"\n'
         'time = "t"\ngroup = "episode"\n'
     )
     pq.write_table(table, tmp_path / "lab.parquet")
@@ -85,7 +85,7 @@ def test_a_strangers_table_is_read_by_a_map(data: FeatureDataset, tmp_path: Path
     back = open_dataset(tmp_path / "lab.h5")
     np.testing.assert_allclose(back.force, data.force, atol=1e-5)
     np.testing.assert_array_equal(back.electrodes, data.electrodes)
-    np.testing.assert_allclose(back.baseline[0], data.electrodes[:5].mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(back.baseline[0], data.electrodes[:2].mean(axis=0), rtol=1e-6)
     assert back.sensor_names == ("left",)
     assert back.provenance.licence == "CC0"
     assert back.time_ns is not None
@@ -221,6 +221,20 @@ def test_whole_times_are_not_rounded(data: FeatureDataset, unit: str, ns: int) -
         (lambda rows: of_type(rows, "time_ns", pa.timestamp("s")), "not times from 1678 to 2261"),
         (lambda rows: of_type(rows, "force_x_n", pa.timestamp("s")), "'force_x_n' holds timestamp"),
         (lambda rows: put(rows, "time_ns", "noon"), "'time_ns' holds string, not numbers"),
+        (
+            lambda rows: rows.drop_columns(["time_ns"]).append_column(
+                "time_ns", pa.array(np.arange(len(rows), dtype=np.int32), pa.time32("s"))
+            ),
+            "not numbers, or timestamps with a date -> give numbers, or timestamps with a date,",
+        ),
+        (
+            lambda rows: put(rows, "in_contact", "yes"),
+            "'in_contact' holds string, not true or false, or 1 or 0 -> give true or false",
+        ),
+        (
+            lambda rows: put(rows, "sensor", f" {rows['sensor'][4]}"),
+            "'sensor' holds .* and ' .*', which differ in spaces only",
+        ),
         (lambda rows: rows.drop_columns(["electrode_7"]), "no column 'electrode_7'"),
         (lambda rows: rows.drop_columns(columns_of("baseline")), "untouched"),
         (lambda rows: put(rows, "electrode_3", 17.5), r"E3 reads 17\.5 in row 4"),

@@ -31,6 +31,9 @@ from palpate_deploy.station.status import duration_text
 if TYPE_CHECKING:  # palpate info and record do not need what draws
     from palpate_services.viewer.touch_errors import RecordErrors
 
+_LOSSES = ("overflow", "lost_at_stop", "lost_disk_full")
+"""Counters of a recorder: messages that came faster than they were written, and so on."""
+
 
 def viewer_command(view: Path) -> str:
     """``rerun FILE``, with the folder of ``rerun`` where it is not on the path."""
@@ -51,7 +54,8 @@ def record_station(
         LinkError: There is no router, or nothing came of the station or of the sensor that is
             named; the record is there, though.
         ConfigError: An unknown topic, or no duration.
-        RecordingError: The folder cannot be made, or a record was removed or moved meanwhile.
+        RecordingError: The folder cannot be made, a record was removed or moved meanwhile, or
+            messages that had arrived are not in it.
     """
     from palpate_services.config import EVERYTHING, RecorderConfig
 
@@ -72,7 +76,10 @@ def record_station(
     instance = f"record-{os.getpid()}"
     own = f"{SERVICE}/{instance}"
     health = Health(SERVICE, instance)
-    run_recorder(config, link, station, stop, instance=instance, health=health)
+    # Who waits for an end of his own choosing gets all; after a signal there is little time.
+    run_recorder(
+        config, link, station, stop, instance=instance, health=health, write_all=duration_s > 0
+    )
     written = sorted(set(config.out.glob("*.mcap")) - before)
     keys = [parse_key(key) for path in written for key in print_contents(path).counts]
     if health.counters.get("records_gone"):
@@ -80,6 +87,12 @@ def record_station(
             "the record is not whole: its file was removed or moved while it was written, "
             f"{health.counters.get('lost_with_record', 0):,} messages are lost",
             remedy="record again, and leave the folder alone until it ends",
+        )
+    if lost := {name: n for name in _LOSSES if (n := health.counters.get(name))}:
+        raise RecordingError(
+            f"the record is not whole: {sum(lost.values()):,} messages that had arrived are not "
+            f"in it ({', '.join(lost)})",
+            remedy="relieve disk and host; record fewer topics: --topic; or no view: --no-rrd",
         )
     if config.sensor != "*" and not any(key.sensor == config.sensor for key in keys):
         raise LinkError(

@@ -24,6 +24,8 @@ class Endpoint(Generic[Q, R]):
         name: Last chunk of its key.
         doc: One line for people.
         per_service: Whether its key names a service instead of a sensor.
+        services: The services that answer, where its key names one; empty = every process.
+        device: What a gateway must have under the sensor's name to answer; empty = anything.
     """
 
     name: str
@@ -31,12 +33,24 @@ class Endpoint(Generic[Q, R]):
     reply: Codec[R]
     doc: str
     per_service: bool = False
+    services: tuple[str, ...] = ()
+    device: str = ""
 
 
 TARE = Endpoint(
-    "tare", codec.TARE_REQUEST, codec.TARE, "tare a BioTac, or look up a tare by its id"
+    "tare",
+    codec.TARE_REQUEST,
+    codec.TARE,
+    "tare a BioTac, or look up a tare by its id",
+    device="BioTac",
 )
-ZERO = Endpoint("zero", codec.WRENCH_ZERO_REQUEST, codec.WRENCH_ZERO, "zero a force/torque sensor")
+ZERO = Endpoint(
+    "zero",
+    codec.WRENCH_ZERO_REQUEST,
+    codec.WRENCH_ZERO,
+    "zero a force/torque sensor",
+    device="force/torque sensor",
+)
 SIMULATE = Endpoint(
     "simulate",
     codec.SIMULATION_REQUEST,
@@ -49,6 +63,7 @@ SIMULATE_AT = Endpoint(
     codec.SIMULATION_REPLY,
     "the same of one replica of the finite-element service; several replies",
     True,
+    ("fem",),
 )
 CANCEL_SIMULATION = Endpoint(
     "simulate_cancel",
@@ -60,7 +75,12 @@ STATUS = Endpoint(
     "status", codec.SERVICE_REQUEST, codec.STATUS, "state and counters of a process", True
 )
 MODEL = Endpoint(
-    "model", codec.SERVICE_REQUEST, codec.MODEL_METADATA, "metadata of the served bundle", True
+    "model",
+    codec.SERVICE_REQUEST,
+    codec.MODEL_METADATA,
+    "metadata of the served bundle",
+    True,
+    ("features", "field", "synthesis"),
 )
 MODELS = Endpoint(
     "models",
@@ -68,6 +88,7 @@ MODELS = Endpoint(
     codec.MODEL_INVENTORY,
     "list, load, unload or roll back bundles; needs the station's admin token",
     True,
+    ("features", "field", "synthesis"),
 )
 ESTIMATE_FEATURES = Endpoint(
     "estimate",
@@ -75,12 +96,23 @@ ESTIMATE_FEATURES = Endpoint(
     codec.FEATURE_ESTIMATE,
     "features of one electrode frame",
     True,
+    ("features",),
 )
 ESTIMATE_FIELD = Endpoint(
-    "estimate", codec.FIELD_REQUEST, codec.FIELD_ESTIMATE, "field of one electrode frame", True
+    "estimate",
+    codec.FIELD_REQUEST,
+    codec.FIELD_ESTIMATE,
+    "field of one electrode frame",
+    True,
+    ("field",),
 )
 SYNTHESISE = Endpoint(
-    "synthesise", codec.FIELD_FRAME, codec.SYNTHESIS_ESTIMATE, "tared counts of one field", True
+    "synthesise",
+    codec.FIELD_FRAME,
+    codec.SYNTHESIS_ESTIMATE,
+    "tared counts of one field",
+    True,
+    ("synthesis",),
 )
 
 SYNTHESISE_FROM = Endpoint(
@@ -89,6 +121,7 @@ SYNTHESISE_FROM = Endpoint(
     codec.SYNTHESIS_REPLY,
     "tared counts of a field, a contact or a simulation; several replies",
     True,
+    ("synthesis",),
 )
 BASIS = Endpoint(
     "basis",
@@ -96,6 +129,7 @@ BASIS = Endpoint(
     codec.FIELD_BASIS,
     "basis of the coefficients of fields; several replies",
     True,
+    ("field",),
 )
 
 ENDPOINTS: dict[str, Endpoint[Any, Any]] = {

@@ -387,6 +387,7 @@ class Session(Closing):
         """The replies; with ``silence`` their absence is an error among them."""
         settle_s = _YOUNG_S if self._young() else 0.0
         asking = self._asking()
+        nobody = partial(no_reply, asking, key, roles=self._link.has_roles, device=endpoint.device)
         return ask(
             asking,
             key,
@@ -395,7 +396,7 @@ class Session(Closing):
             timeout_s=timeout_s,
             everyone=everyone,
             settle_s=settle_s,
-            silence=partial(no_reply, asking, key, roles=self._link.has_roles) if silence else None,
+            silence=nobody if silence else None,
             on_timings=on_timings,
         )
 

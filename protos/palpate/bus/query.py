@@ -279,12 +279,14 @@ def raise_errors(replies: Iterator[R | PalpateError]) -> Iterator[R]:
         yield reply
 
 
-def no_reply(session: zenoh.Session, key: str, known: bool, *, roles: bool = False) -> LinkError:
+def no_reply(
+    session: zenoh.Session, key: str, known: bool, *, roles: bool = False, device: str = ""
+) -> LinkError:
     """The error for a question that had no reply at all: nobody serves it, or the reply was lost.
 
     Zenoh tells neither. If nobody was ``known`` to serve the key when it was asked, that is looked
     up once more here. With ``roles`` the question may also have been refused on its way, of which
-    Zenoh does not tell either.
+    Zenoh does not tell either. ``device`` is what the question is put to, if only gateways answer.
     """
     served = known or is_served(session, key, LOOK_S)
     if roles and served:
@@ -298,6 +300,11 @@ def no_reply(session: zenoh.Session, key: str, known: bool, *, roles: bool = Fal
             f"{key} is served, but no answer arrived: it ended while it worked on the question, "
             f"or its answer is {_DROPPED}",
             remedy="ask again; if that fails, ask for less and look at the log of the service",
+        )
+    if device:
+        return LinkError(
+            f"no gateway has a {device} of this name: nobody answers on {key}",
+            remedy="see which sensors there are: palpate status; start the gateway: palpate up",
         )
     return LinkError(
         f"no service answers on {key}",

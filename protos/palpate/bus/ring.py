@@ -150,7 +150,7 @@ class Ring(Closing):
                 if not is_wake(sample):
                     return sample
         except zenoh.ZError as error:
-            raise self._closed(error) from error
+            raise self._closed() from error
         return None
 
     def wait(self, timeout_s: float) -> zenoh.Sample | None:
@@ -168,13 +168,13 @@ class Ring(Closing):
                 self._alarm.set(self, deadline_s)
             return sample
         except zenoh.ZError as error:
-            raise self._closed(error) from error
+            raise self._closed() from error
         finally:
             self._alarm.set(self, math.inf)
 
-    def _closed(self, error: zenoh.ZError) -> LinkError:
+    def _closed(self) -> LinkError:
         return LinkError(
-            f"the subscription to {self._key} is closed: {error}", remedy="open the session again"
+            f"the subscription to {self._key} is closed", remedy="open the session again"
         )
 
     def wake(self) -> None:

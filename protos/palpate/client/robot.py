@@ -52,7 +52,7 @@ from palpate.config import (
     check_name,
     joining_link,
 )
-from palpate.errors import ConfigError, StaleError, StreamTimeout
+from palpate.errors import ConfigError, LinkError, StaleError, StreamTimeout
 from palpate.messages import (
     ContactDescription,
     ElectrodeFrame,
@@ -131,10 +131,18 @@ class Client(Closing):
         self._unseen: dict[tuple[str, str], tuple[Subscriber[Any], SameSensor]] = {}
         self._streams: list[Stream[Any]] = []
         self._publishers: list[RobotPosePublisher] = []
-        self.session = Session.open(
+        self._session = Session.open(
             joining_link(connect, wait_s=timeout_s, tls=tls), station=check_name(name, "station")
         )
+        self._closed = False
         _open.add(self)
+
+    @property
+    def session(self) -> Session:
+        """What the client is connected by."""
+        if self._closed:
+            raise LinkError("the client is closed", remedy="open a new Client")
+        return self._session
 
     def features(self, sensor: str, *, max_age_s: float = 0.05) -> FeatureEstimate:
         """Contact location and force of one finger now.
@@ -345,11 +353,12 @@ class Client(Closing):
             SensorChanged: It is the first of another sensor; told once.
         """
         check_process()  # before the lock, which a thread that is not here may hold
+        session = self.session
         check_duration(timeout_s, "timeout_s", most=LONGEST_S)
         key = (FEATURES.name, check_name(sensor, "sensor"))
         with self._lock:
             if key not in self._unseen:
-                made = self.session.subscriber(FEATURES, sensor=sensor)
+                made = session.subscriber(FEATURES, sensor=sensor)
                 self._unseen[key] = made, SameSensor(made.key)
             subscriber, same = self._unseen[key]
         received: ReceivedMessage[FeatureEstimate] = subscriber.next(timeout_s)
@@ -469,6 +478,7 @@ class Client(Closing):
         _open.discard(self)
         if is_inherited():
             return
+        self._closed = True
         for publisher in self._publishers:
             publisher.close()
         with self._lock:
@@ -477,7 +487,7 @@ class Client(Closing):
             stream.close()
         for stream in streams:
             stream.wait_for_calls()
-        self.session.close()
+        self._session.close()
 
     def _stream(
         self, topic: Topic[M], sensor: str, max_age_s: float, timeout_s: float | None, depth: int
@@ -500,12 +510,13 @@ class Client(Closing):
 
     def _latest(self, topic: Topic[M], sensor: str, max_age_s: float) -> M:
         check_process()
+        session = self.session
         check_duration(max_age_s, "max_age_s", most=math.inf)
         key = (topic.name, check_name(sensor, "sensor"))
         with self._lock:
             first = key not in self._newest
             if first:
-                made = self.session.subscriber(topic, sensor=sensor, delivery=Delivery.NEWEST)
+                made = session.subscriber(topic, sensor=sensor, delivery=Delivery.NEWEST)
                 self._newest[key] = made, SameSensor(made.key), threading.Lock()
             subscriber, same, lock = self._newest[key]
         end_s = time.monotonic() + (self._timeout_s if first else 0.0)

@@ -47,6 +47,18 @@ def codec_of(
     schema = message_type.DESCRIPTOR.full_name
     parse = message_type.FromString
 
+    def encode_own(value: M) -> bytes:
+        try:
+            return encode(value)
+        except WireError as error:  # checks are those of decoding, which blame the sender
+            if error.remedy != _SENDER:
+                raise
+            raise WireError(
+                error.problem,
+                remedy=f"correct the value; docs/messages.md says what {schema} may hold",
+                reason=error.reason,
+            ) from error
+
     def decode(payload: bytes) -> M:
         try:
             message = parse(payload)
@@ -58,7 +70,7 @@ def codec_of(
             ) from error
         return from_wire(message)
 
-    return Codec(schema, encode, decode, message_type)
+    return Codec(schema, encode_own, decode, message_type)
 
 
 _ELECTRODES = {kind.layout.electrodes: kind.name for kind in SensorType}

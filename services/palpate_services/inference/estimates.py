@@ -56,8 +56,11 @@ class EstimateRefusal(StrEnum):
     """Why a message got no estimate; the value is the name of its counter."""
 
     UNTARED = "untared"
-    """The frame was taken before any tare; or the given tare is not the one that the frame names,
-    or has another number of electrodes."""
+    """The frame was taken before any tare; or the given tare is not the one that it names."""
+
+    WRONG_TARE = "wrong_tare"
+    """The tare that the frame names is that of another finger: of another serial number, or with
+    another number of electrodes."""
 
     TARE_UNKNOWN = "tare_unknown"
     """No gateway knows the tare that the frame names."""
@@ -168,7 +171,7 @@ def sample_of_frame(
         tare.electrodes.shape != frame.electrodes.shape
         or tare.sensor_serial != frame.sensor_serial  # of a finger that was exchanged
     ):
-        return EstimateRefusal.UNTARED
+        return EstimateRefusal.WRONG_TARE
     if not frame.electrodes_valid:
         return EstimateRefusal.INVALID_CHANNELS
     quality = quality_of_frame(frame, tare)

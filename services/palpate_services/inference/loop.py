@@ -66,8 +66,14 @@ _COUNTED_HERE = frozenset({"received", "delivered"})
 _ERRORS: dict[EstimateRefusal, tuple[ErrorCode, str, str]] = {
     EstimateRefusal.UNTARED: (
         ErrorCode.INVALID_REQUEST,
-        "the frame was taken before any tare, or with another tare than its gateway knows",
+        "the frame was taken before any tare",
         "tare the untouched sensor and send a later frame: palpate tare",
+    ),
+    EstimateRefusal.WRONG_TARE: (
+        ErrorCode.INVALID_REQUEST,
+        "the tare that the frame names is of another finger than the frame: their serial numbers "
+        "or electrodes differ",
+        "ask about the finger that the frame is of; after an exchange tare again: palpate tare",
     ),
     EstimateRefusal.INVALID_CHANNELS: (
         ErrorCode.INVALID_REQUEST,

@@ -40,11 +40,13 @@ def run_recorder(
     *,
     instance: str = "recorder",
     health: Health | None = None,
+    write_all: bool = False,
 ) -> None:
     """Record until ``stop`` is set; then write the samples that have arrived and close the files.
 
     The arguments are those of ``run_estimating``; ``health`` receives state and counters, None = it
-    makes its own.
+    makes its own. ``write_all``: However long it takes; else those are counted as lost for which
+    ``drain_s`` leaves no time.
 
     Raises:
         ConfigError: An unknown topic, or a bundle that does not exist.
@@ -80,7 +82,7 @@ def run_recorder(
                 while _drain(tap, files, lambda: time.monotonic() < now_s + config.drain_s / 2):
                     time.sleep(_BATCH_S)
                 tap.close()
-                _drain(tap, files, lambda: time.monotonic() < until_s)
+                _drain(tap, files, lambda: write_all or time.monotonic() < until_s)
             finally:
                 tap.close()
                 _count_the_rest(tap, health)

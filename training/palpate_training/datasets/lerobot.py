@@ -6,8 +6,9 @@ for each feature, ``meta/info.json``, ``meta/stats.json``, ``meta/tasks.parquet`
 versions 2 and 3, in order.
 
 An episode is a run of rows of one press at an even rate: LeRobot computes times from the number of
-a frame, and refuses others. The true time of a row stays in the feature ``time_ns``, its finger in
-``sensor``, its press in ``group`` and ``block``.
+a frame, and refuses others. A row whose time differs from that by more than half a step begins the
+next one. The true time of a row stays in the feature ``time_ns``, its finger in ``sensor``, its
+press in ``group`` and ``block``.
 """
 
 from __future__ import annotations
@@ -35,7 +36,10 @@ TASK = "press the finger"
 _NAMES = {ELECTRODES: [f"E{number + 1}" for number in range(ELECTRODES)], 3: list("xyz")}
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _STEP_TOLERANCE = 0.5
-"""Share of a step by which the next row may be early or late."""
+"""Share of a step by which a row may be early or late."""
+
+_RATE_TOLERANCE = 0.02
+"""Share by which a sensor's rows a second may differ from the rate of all."""
 
 Ints = npt.NDArray[np.int64]
 
@@ -49,14 +53,14 @@ def export_lerobot(folder: Path, data: FeatureDataset, *, fps: float | None = No
         fps: Rows a second; None = what the rows' times say.
 
     Raises:
-        DatasetError: The folder exists, the rows have no times and no rate is given, or the disk
-            refused.
+        DatasetError: The folder exists, the rows have no times and no rate is given, the times of a
+            sensor say another rate, or the disk refused.
         MissingExtraError: pyarrow is not installed.
     """
     arrow = require("pyarrow", extra="training")
     import pyarrow.parquet as parquet
 
-    rate = _rate(data) if fps is None else float(fps)
+    rate = _rate(data, fps)
     episode = _episodes(data, rate)
     starts = np.flatnonzero(np.diff(episode, prepend=-1))
     lengths = np.diff(np.append(starts, len(data)))
@@ -134,28 +138,59 @@ def read_lerobot(folder: Path) -> pa.Table:
         ) from error
 
 
-def _rate(data: FeatureDataset) -> float:
+def _rate(data: FeatureDataset, fps: float | None) -> float:
+    """Rows a second of all sensors: ``fps``, or what the times of the first one say.
+
+    Raises:
+        DatasetError: Nothing says it, or the times of a sensor say something else.
+    """
+    remedy = "say how many rows there are a second: --fps"
     if data.time_ns is None:
+        if fps is None:
+            raise DatasetError(f"{data.name}: rows have no times", remedy=remedy)
+        return float(fps)
+    steps = np.diff(data.time_ns)
+    same = (np.diff(data.group) == 0) & (np.diff(data.sensor) == 0) & (steps > 0)
+    rates = {
+        name: _even_rate(own)
+        for number, name in enumerate(data.sensor_names)
+        if len(own := steps[same & (data.sensor[1:] == number)])
+    }
+    if fps is None and not rates:
         raise DatasetError(
-            f"{data.name}: rows have no times", remedy="say how many there are a second: --fps"
+            f"{data.name}: no press has two rows with times that rise", remedy=remedy
         )
-    same = (np.diff(data.group) == 0) & (np.diff(data.sensor) == 0)
-    steps = np.diff(data.time_ns)[same]
-    steps = steps[steps > 0]
-    if not len(steps):
-        raise DatasetError(
-            f"{data.name}: no press has two rows with times that rise",
-            remedy="say how many rows there are a second: --fps",
-        )
+    rate = float(fps) if fps is not None else next(iter(rates.values()))
+    for name, own_rate in rates.items():
+        if abs(own_rate / rate - 1.0) > _RATE_TOLERANCE:
+            raise DatasetError(
+                f"{data.name}: by their times the rows of {name!r} come at {own_rate:g} a second,"
+                f" not {rate:g}",
+                remedy="leave --fps out, and export sensors of different rates as data sets of"
+                " their own",
+            )
+    return rate
+
+
+def _even_rate(steps_ns: Ints) -> float:
+    """Rows a second by the steps between them [ns], those over a missing row aside."""
+    usual = np.median(steps_ns)
+    even = steps_ns[np.abs(steps_ns - usual) <= _STEP_TOLERANCE * usual]
     # Rounded to what people call such a rate: 100 and not 99.998 a second.
-    return float(f"{1e9 / float(np.median(steps)):.4g}")
+    return float(f"{1e9 / float(np.mean(even)):.4g}")
 
 
 def _episodes(data: FeatureDataset, rate: float) -> Ints:
     """Number of each row's episode: it ends with a press, a sensor, and where a row is missing."""
     new = (np.diff(data.group) != 0) | (np.diff(data.sensor) != 0)
     if data.time_ns is not None:
-        new |= np.abs(np.diff(data.time_ns) * 1e-9 * rate - 1.0) > _STEP_TOLERANCE
+        since_s = 1e-9 * (data.time_ns - data.time_ns[0])
+        late = since_s * rate - np.arange(len(data))
+        first = 0
+        for row in range(1, len(data)):
+            new[row - 1] |= abs(late[row] - late[first]) > _STEP_TOLERANCE
+            if new[row - 1]:
+                first = row
     return np.concatenate([[0], np.cumsum(new)]).astype(np.int64)
 
 

@@ -9,7 +9,6 @@ which columns are what.
 from __future__ import annotations
 
 import json
-import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,11 +33,10 @@ from palpate_training.datasets.features import (
     FeatureDataset,
     cut_into_blocks,
 )
+from palpate_training.datasets.table_columns import MISSING, Columns, TableColumns, Values
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-Values = npt.NDArray[np.float64]
 
 BLOCKS = 20
 """Contiguous pieces that a sensor's rows are cut into where nothing says what one press is."""
@@ -46,11 +44,11 @@ BLOCKS = 20
 PROVENANCE_COLUMNS = ("source", "licence")
 """Columns of a CSV file of ours that say the same in every row."""
 
+REST_FORCE_N = 0.5
+"""A force above it is a touch in rows that are said to be untouched [N]; noise is below."""
+
 LABELS = ("sensor", "group", "block")
 """Keys of a map, and columns of ours, that hold names."""
-
-MISSING = np.iinfo(np.int64).min
-"""Stands for a time, a label or a truth that a row lacks."""
 
 METADATA = b"palpate.features"
 """Key of a table's metadata: where its rows come from, as JSON."""
@@ -76,8 +74,6 @@ _UNITS = {
     "time": {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9},
 }
 _LENGTHS = ("contact_location", "centre_of_pressure")
-
-Columns = str | Annotated[list[str], Field(min_length=1)]
 
 
 class ColumnMap(BaseModel):
@@ -296,7 +292,7 @@ def dataset_of(
             number is missing; electrodes are no whole counts, the rest no counts; nothing says what
             electrodes read untouched; rows of a press are not in order of time.
     """
-    reader = _Reader(table, source)
+    reader = TableColumns(table, source)
     arrays: dict[str, Any] = {
         "electrodes": reader.numbers(columns.electrodes, ELECTRODES),
         "force": reader.numbers(columns.force, 3) * _UNITS["force"][columns.force_unit],
@@ -318,10 +314,9 @@ def dataset_of(
     kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
     arrays = {name: array[kept] for name, array in arrays.items()}
     arrays["electrodes"] = _counts(arrays["electrodes"], np.flatnonzero(kept), source)
-    if "baseline" in arrays:
-        _check_rest(arrays["baseline"], np.flatnonzero(kept), source)
-    else:
-        arrays["baseline"] = _rest(arrays, columns.rest_rows, source)
+    if "baseline" not in arrays:
+        arrays["baseline"] = _rest(arrays, columns.rest_rows, np.flatnonzero(kept), source)
+    _check_rest(arrays["baseline"], np.flatnonzero(kept), source)
     ours = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
     across = columns.groups_across_sensors or ours
     arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
@@ -364,122 +359,6 @@ def _notes(columns: ColumnMap, names: Sequence[str], left_out: int) -> Iterator[
         yield f"columns: {columns.model_dump_json(exclude_defaults=True)}"
     if left_out:
         yield f"{left_out} incomplete rows left out"
-
-
-class _Reader:
-    """Columns of a table by name, with errors that say which and where."""
-
-    def __init__(self, table: pa.Table, source: Path) -> None:
-        self._table, self._source = table, source
-        if not table.num_rows:
-            raise DatasetError(f"{source} has no rows", remedy="give a table with rows")
-
-    def numbers(self, names: Columns, width: int) -> Values:
-        """Numbers, shape (N, width); NaN where one is missing."""
-        if isinstance(names, str):
-            return self._lists(names, width)
-        if len(names) != width:
-            raise DatasetError(
-                f"{self._source}: {len(names)} columns are named from {names[0]!r} on, not {width}",
-                remedy="name one column for each, in order",
-            )
-        return np.stack([self._column(name) for name in names], axis=1)
-
-    def truths(self, name: str) -> npt.NDArray[np.int64]:
-        """1 = true, 0 = false, or ``MISSING``, shape (N,)."""
-        values = self._column(name)
-        lacking = np.isnan(values)
-        wrong = np.flatnonzero((values != 0.0) & (values != 1.0) & ~lacking)
-        if wrong.size:
-            raise self._wrong(name, int(wrong[0]), f"{values[wrong[0]]:g}", "true or false")
-        return np.where(lacking, MISSING, values == 1.0)
-
-    def times(self, name: str, scale: float) -> npt.NDArray[np.int64]:
-        """Times [ns] or ``MISSING``, shape (N,); whole numbers and timestamps are not rounded."""
-        column = self._found(name)
-        if "timestamp" in str(column.type):  # which says its unit itself
-            known = self._cast(name, "timestamp[ns]", "not times from 1678 to 2261", safe=True)
-            column, scale = known.cast("int64"), 1.0
-        whole = str(column.type).removeprefix("u").startswith("int")
-        values = column.fill_null(0).to_numpy() if whole else self._column(name)
-        lacking = column.is_null().to_numpy() if whole else np.isnan(values)
-        most = (2**63 - 1) // int(scale)
-        wrong = np.flatnonzero(~((values > -most) & (values < most)) & ~lacking)
-        if wrong.size:
-            raise self._wrong(name, int(wrong[0]), f"{values[wrong[0]]:g}", "a time")
-        # A float would round times of today, as it has 53 bits.
-        times = values.astype(np.int64) * int(scale) if whole else np.rint(values * scale)
-        return np.where(lacking, MISSING, np.where(lacking, 0, times).astype(np.int64))
-
-    def labels(
-        self, name: str | None, else_: str, *, keep: bool = False
-    ) -> tuple[tuple[str, ...], Any]:
-        """Labels in order of appearance, and the number of each row's or ``MISSING``, (N,).
-
-        ``keep``: If all are whole numbers, these.
-        """
-        if name is None:
-            return (else_,), np.zeros(self._table.num_rows, np.int64)
-        words = [
-            "" if value is None or value != value else str(value).strip()
-            for value in self._found(name).to_pylist()
-        ]
-        numbers = {word: number for number, word in enumerate(dict.fromkeys(filter(None, words)))}
-        if keep and all(re.fullmatch("0|[1-9][0-9]{0,8}", word) for word in numbers):  # int32
-            numbers = {word: int(word) for word in numbers}
-        return tuple(numbers), np.array([numbers.get(word, MISSING) for word in words], np.int64)
-
-    def _found(self, name: str) -> Any:
-        if name not in self._table.column_names:
-            there = ", ".join(self._table.column_names[:40])
-            raise DatasetError(
-                f"{self._source} has no column {name!r}; it has: {there}",
-                remedy="say which columns are what: --columns MAP.toml, see docs/data.md",
-            )
-        if self._table.column_names.count(name) > 1:
-            raise DatasetError(
-                f"{self._source} has several columns {name!r}", remedy="give each its own name"
-            )
-        return self._table.column(name)
-
-    def _column(self, name: str) -> Values:
-        """Numbers of one column, shape (N,); a minus before its name turns the sign."""
-        plain = name.removeprefix("-") if name not in self._table.column_names else name
-        values = np.asarray(self._cast(plain, "float64", "not numbers").to_numpy(), np.float64)
-        return values if plain == name else -values
-
-    def _cast(self, name: str, kind: str, other: str, *, safe: bool = False) -> Any:
-        column = self._found(name)
-        try:
-            return column.cast(kind, safe=safe)
-        except (ValueError, TypeError, NotImplementedError) as error:  # bases of Arrow's errors
-            raise DatasetError(
-                f"{self._source}: column {name!r} holds {column.type}, {other}",
-                remedy="give numbers (for a time also timestamps), or name another column",
-            ) from error
-
-    def _lists(self, name: str, width: int) -> Values:
-        column = self._found(name)
-        if "list" not in str(column.type):
-            return self.numbers([name], width)
-        rows = column.to_pylist()
-        for number, row in enumerate(rows):
-            if row is None or len(row) != width:
-                size = "nothing" if row is None else f"{len(row)} numbers"
-                raise self._wrong(name, number, size, f"{width} numbers")
-        try:
-            return np.array(rows, np.float64)
-        except (ValueError, TypeError) as error:  # of lists of text, or of lists
-            raise DatasetError(
-                f"{self._source}: column {name!r} holds {column.type}, not lists of numbers",
-                remedy="give numbers (for a time also timestamps), or name another column",
-            ) from error
-
-    def _wrong(self, name: str, row: int, found: str, wanted: str) -> DatasetError:
-        return DatasetError(
-            f"{self._source}: column {name!r} holds {found} in row {row}, not {wanted}",
-            remedy="mend the table, or name another column",
-        )
 
 
 def _complete(
@@ -553,9 +432,16 @@ def _check_rest(rest: Values, rows: npt.NDArray[np.int64], source: Path) -> None
         )
 
 
-def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
-    """Untouched counts of each row: the mean of the first rows of its sensor."""
-    if rows is None:
+def _rest(
+    arrays: Mapping[str, Any], count: int | None, rows: npt.NDArray[np.int64], source: Path
+) -> Values:
+    """Untouched counts of each row: the mean of the first ``count`` rows of its sensor.
+
+    Raises:
+        DatasetError: There are too few, or something touches in one of them; ``rows`` are those of
+            the table.
+    """
+    if count is None:
         raise DatasetError(
             f"{source}: nothing says what the electrodes read untouched",
             remedy="name columns of the rest, or untouched rows at the beginning: rest_rows = 100",
@@ -563,12 +449,25 @@ def _rest(arrays: Mapping[str, Any], rows: int | None, source: Path) -> Values:
     rest: Values = np.empty_like(arrays["electrodes"])
     for sensor in np.unique(arrays["sensor"]):
         own = np.flatnonzero(arrays["sensor"] == sensor)
-        if len(own) <= rows:
+        if len(own) <= count:
             raise DatasetError(
-                f"{source}: a sensor has {len(own)} rows, {rows} of them untouched",
+                f"{source}: a sensor has {len(own)} rows, {count} of them untouched",
                 remedy="give fewer untouched rows: rest_rows",
             )
-        rest[own] = arrays["electrodes"][own[:rows]].mean(axis=0)
+        first, force = own[:count], arrays["force"][own]
+        # From the least force: that of a force sensor which was not zeroed is no touch.
+        size = np.linalg.norm(force - force[np.linalg.norm(force, axis=1).argmin()], axis=1)
+        touched = size[:count] > REST_FORCE_N
+        if "in_contact" in arrays:
+            touched |= arrays["in_contact"][first] == 1
+        if touched.any():
+            row = int(touched.argmax())
+            raise DatasetError(
+                f"{source}: row {rows[first[row]]} is one of the {count} untouched ones of its"
+                f" sensor, but something touches in it ({np.linalg.norm(force[row]):.2g} N)",
+                remedy="give fewer untouched rows: rest_rows; or name columns of the rest",
+            )
+        rest[own] = arrays["electrodes"][first].mean(axis=0)
     return rest
 
 
