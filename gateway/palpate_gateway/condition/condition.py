@@ -292,7 +292,7 @@ class Condition:
         ``exchanged`` = it is another finger: nothing is known of its level.
         """
         if exchanged:
-            self.level, self._tared_s = UntouchedLevel(), None
+            self.level, self._tared = UntouchedLevel(), None
         self._blocks.begin()
         self._recent.clear()
         self.channels.begin()
