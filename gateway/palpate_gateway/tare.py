@@ -169,7 +169,7 @@ class TareLedger:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Request:
+class _AskedTare:
     collector: TareCollector
     future: Future[Tare]
     anyway: bool
@@ -205,7 +205,7 @@ class TareAttempts:
         self._distance = distance
         self._own = TareCollector(frames, limits) if at_start else None
         self._lock = threading.Lock()
-        self._requested: list[_Request] = []
+        self._requested: list[_AskedTare] = []
         self._over = ""
 
     @property
@@ -249,7 +249,7 @@ class TareAttempts:
                     f"{sensor} cannot be tared: {self._over or never}",
                     remedy="tare a live sensor, or ask for a known tare by its id",
                 )
-            self._requested.append(_Request(collector, future, anyway))
+            self._requested.append(_AskedTare(collector, future, anyway))
         return future
 
     def offer(self, frame: ElectrodeFrame) -> list[Tare]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.protos.robot_client import Finger, FrameOf
 
 from palpate import clock
 from palpate.bus import Session
@@ -315,3 +316,11 @@ def pair(link: LinkConfig) -> Iterator[tuple[Session, Session]]:
     """Two sessions on one bus."""
     with Session.open(link) as a, Session.open(link) as b:
         yield a, b
+
+
+@pytest.fixture
+def finger(link: LinkConfig, frame_of: FrameOf, examples: dict[str, Any]) -> Iterator[Finger]:
+    with Session.open(link) as session:
+        finger = Finger(session, frame_of, examples["FeatureEstimate"])
+        yield finger
+        finger.close()

@@ -1,10 +1,7 @@
-"""The robot's client: streams, callbacks, asyncio, and what it refuses by name."""
+"""The robot's client: streams, callbacks, and what it refuses by name."""
 
 from __future__ import annotations
 
-import asyncio
-import dataclasses
-import inspect
 import itertools
 import logging
 import math
@@ -14,18 +11,26 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any, cast
 
 import pytest
 import zenoh
+from tests.protos.robot_client import (
+    CALLS,
+    LIVE_S,
+    Finger,
+    FrameOf,
+    WaitUntil,
+    public_names,
+    simulation_request,
+)
 
-from palpate import AsyncClient, Client
+from palpate import Client
 from palpate.bus import Session, endpoints, run_router
 from palpate.bus.topics import FEATURES
 from palpate.bus.zenoh_session import close_zenoh
-from palpate.client.simulations import straight_path
 from palpate.config import LinkConfig
 from palpate.errors import (
     ClockSkewError,
@@ -37,62 +42,8 @@ from palpate.errors import (
     StreamTimeout,
 )
 from palpate.messages import (
-    ElectrodeFrame,
     FeatureEstimate,
-    SimulationProgress,
-    SimulationReply,
-    SimulationRequest,
-    Tare,
-    TareRequest,
 )
-
-FrameOf = Callable[..., ElectrodeFrame]
-WaitUntil = Callable[..., None]
-LIVE_S = 20.0
-"""Longest wait for what has to happen."""
-
-
-def _public(kind: type) -> set[str]:
-    return {name for name, _ in inspect.getmembers(kind, callable) if name[0] != "_"}
-
-
-class Finger:
-    """Publishes features of ``finger`` 100 times a second, as a service does."""
-
-    def __init__(self, session: Session, frame_of: FrameOf, estimate: FeatureEstimate) -> None:
-        self._publisher = session.publisher(FEATURES, sensor="finger")
-        self._frame_of, self._estimate = frame_of, estimate
-        self.delay_ns = 0
-        self.silent = False
-        self.serial = estimate.sensor_serial
-        self._stop = threading.Event()
-        self.sequence = 0
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._stop.wait(0.01):
-            if not self.silent:
-                self.sequence += 1
-                stamp = self._frame_of(self.sequence).stamp
-                stamp = dataclasses.replace(
-                    stamp, monotonic_ns=max(stamp.monotonic_ns - self.delay_ns, 1)
-                )
-                self._publisher.put(
-                    dataclasses.replace(self._estimate, source=stamp, sensor_serial=self.serial)
-                )
-
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join(LIVE_S)
-
-
-@pytest.fixture
-def finger(link: LinkConfig, frame_of: FrameOf, examples: dict[str, Any]) -> Iterator[Finger]:
-    with Session.open(link) as session:
-        finger = Finger(session, frame_of, examples["FeatureEstimate"])
-        yield finger
-        finger.close()
 
 
 @pytest.fixture
@@ -310,9 +261,9 @@ def test_streams_and_questions_go_on_after_router_and_service_were_gone(
         lambda robot: robot.zero("wrist", readings=-1),
         lambda robot: robot.model(service="no/such"),
         lambda robot: robot.cancel_simulation("r-1", sensor="*"),
-        lambda robot: robot.simulate(_request(), sensor="*"),
-        lambda robot: robot.simulate(_request(), timeout_s=-1.0),
-        lambda robot: robot.simulate(_request(), timeout_s=math.nan),
+        lambda robot: robot.simulate(simulation_request(), sensor="*"),
+        lambda robot: robot.simulate(simulation_request(), timeout_s=-1.0),
+        lambda robot: robot.simulate(simulation_request(), timeout_s=math.nan),
         lambda robot: robot.robot_pose_publisher("*"),
     ],
 )
@@ -330,11 +281,6 @@ def shared_robot(
 ) -> Iterator[Client]:
     with router() as link, Client(link.connect[0], timeout_s=LIVE_S) as robot:
         yield robot
-
-
-def _request() -> SimulationRequest:
-    path = straight_path((-0.004, 0.0, -0.011), (-0.004, 0.0, -0.007), 2)
-    return SimulationRequest("r-1", "sphere_7mm", path)
 
 
 _LEFT_OPEN = """
@@ -432,35 +378,6 @@ def test_a_fork_after_a_client_was_opened_is_refused_and_hangs_nowhere(
     assert (result.stdout, result.stderr) == ("before 0\nafter 0\nends\n", "")
 
 
-_CALLS: dict[str, Callable[[Any, dict[str, Any]], object]] = {
-    "features": lambda robot, _: robot.features("finger"),
-    "electrodes": lambda robot, _: robot.electrodes("finger"),
-    "field": lambda robot, _: robot.field("finger"),
-    "synthesis": lambda robot, _: robot.synthesis("finger"),
-    "stream_features": lambda robot, _: robot.stream_features("finger"),
-    "stream_electrodes": lambda robot, _: robot.stream_electrodes("finger"),
-    "stream_field": lambda robot, _: robot.stream_field("finger"),
-    "stream_synthesis": lambda robot, _: robot.stream_synthesis("finger"),
-    "stream_wrench": lambda robot, _: robot.stream_wrench("finger"),
-    "estimate_features": lambda robot, of: robot.estimate_features("finger", of["ElectrodeFrame"]),
-    "estimate_field": lambda robot, of: robot.estimate_field("finger", of["ElectrodeFrame"]),
-    "field_basis": lambda robot, _: robot.field_basis(),
-    "synthesise": lambda robot, of: robot.synthesise(of["FieldFrame"]),
-    "synthesise_from": lambda robot, of: robot.synthesise_from(of["FieldFrame"]),
-    "next_features": lambda robot, _: robot.next_features("finger"),
-    "robot_pose_publisher": lambda robot, _: robot.robot_pose_publisher("arm"),
-    "tare": lambda robot, _: robot.tare("finger"),
-    "zero": lambda robot, _: robot.zero("finger"),
-    "simulate": lambda robot, _: robot.simulate(_request()),
-    "cancel_simulation": lambda robot, _: robot.cancel_simulation("r-1"),
-    "model": lambda robot, _: robot.model(),
-    "alive": lambda robot, _: robot.alive(),
-    "status": lambda robot, _: robot.status(),
-    "census": lambda robot, _: robot.census(),
-}
-"""Every call of a client, of its name."""
-
-
 @pytest.fixture(scope="module")
 def closed_robot(
     router: Callable[[], AbstractContextManager[LinkConfig]],
@@ -470,12 +387,12 @@ def closed_robot(
         yield robot
 
 
-@pytest.mark.parametrize("name", sorted(_public(Client) - {"close"}))
+@pytest.mark.parametrize("name", sorted(public_names(Client) - {"close"}))
 def test_every_call_of_a_closed_client_says_that_it_is_closed(
     closed_robot: Client, examples: dict[str, Any], name: str
 ) -> None:
     with pytest.raises(LinkError, match="the client is closed -> open a new Client"):
-        _CALLS[name](closed_robot, examples)
+        CALLS[name](closed_robot, examples)
 
 
 def test_a_closed_client_that_has_read_says_that_it_is_closed(
@@ -583,223 +500,3 @@ def test_router_and_station_may_come_from_the_environment(
     monkeypatch.setenv("PALPATE_STATION", "cellar")
     with Client(timeout_s=LIVE_S) as robot:
         assert robot.session.station == "cellar"
-
-
-# --- asyncio --------------------------------------------------------------------------------------
-
-
-def test_every_method_of_the_client_is_there_for_asyncio() -> None:
-    assert _public(Client) - {"close"} <= _public(AsyncClient)
-
-
-@pytest.mark.parametrize("name", ["alive", "features", "tare"])
-def test_an_async_client_whose_session_is_closed_says_so(
-    link: LinkConfig, examples: dict[str, Any], name: str
-) -> None:
-    async def call() -> object:
-        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
-            robot.sync.close()
-            return await cast("Coroutine[Any, Any, object]", _CALLS[name](robot, examples))
-
-    with pytest.raises(LinkError, match="closed"):
-        asyncio.run(call())
-
-
-def test_an_async_client_streams_asks_and_leaves_the_loop_free(
-    link: LinkConfig, finger: Finger, examples: dict[str, Any]
-) -> None:
-    async def scene() -> None:
-        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
-            seen: list[int] = []
-            async for estimate in robot.stream_features("finger", max_age_s=LIVE_S):
-                seen.append(estimate.source.sequence)
-                if len(seen) == 3:
-                    break
-            assert seen == sorted(set(seen))
-            estimate = await robot.features("finger", max_age_s=LIVE_S)
-            assert estimate.force.tolist() == examples["FeatureEstimate"].force.tolist()
-            with pytest.raises(LinkError, match="no gateway has a BioTac of this name"):
-                await robot.tare("nobody")
-            with pytest.raises(ConfigError):
-                await robot.features("*")
-            turns = 0
-
-            async def count() -> None:
-                nonlocal turns
-                while True:
-                    await asyncio.sleep(0.005)
-                    turns += 1
-
-            counting = asyncio.create_task(count())
-            with pytest.raises(StreamTimeout):
-                await robot.next_features("nobody", timeout_s=0.5)
-            counting.cancel()
-            assert turns >= 3, "the loop ran while the call waited"
-        with pytest.raises(LinkError, match="async with"):
-            await robot.features("finger")
-
-    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
-
-
-def test_an_async_stream_says_that_it_is_silent_and_goes_on(
-    link: LinkConfig, finger: Finger
-) -> None:
-    async def scene() -> None:
-        async with (
-            AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot,
-            robot.stream_features("finger", max_age_s=LIVE_S, timeout_s=0.3) as stream,
-        ):
-            await anext(stream)
-            finger.silent = True
-            with pytest.raises(StreamTimeout):
-                [_ async for _ in stream]
-            finger.silent = False
-            while True:
-                try:
-                    await anext(stream)
-                except StreamTimeout:
-                    continue
-                break
-            await stream.aclose()
-            with pytest.raises(StopAsyncIteration):
-                await anext(stream)
-
-    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
-
-
-def test_an_async_stream_tells_of_another_sensor_though_its_task_is_slow(
-    link: LinkConfig, finger: Finger
-) -> None:
-    async def scene() -> None:
-        async with (
-            AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot,
-            robot.stream_features("finger", max_age_s=LIVE_S) as stream,
-        ):
-            await anext(stream)
-            finger.serial = "BT-OTHER"
-            skipped = stream.counters["skipped"]
-            while stream.counters["skipped"] < skipped + 20:  # enough to push it out
-                await asyncio.sleep(0.05)
-            with pytest.raises(SensorChanged):
-                await anext(stream)
-            assert (await anext(stream)).sensor_serial == "BT-OTHER"
-
-    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
-
-
-async def _begun(
-    ask: Callable[[], Coroutine[Any, Any, object]], begun: threading.Event
-) -> asyncio.Task[object]:
-    """A question that has reached its service, which may not be known here at first."""
-    while True:
-        asking = asyncio.create_task(ask())
-        while not asking.done():
-            if begun.is_set():
-                return asking
-            await asyncio.sleep(0.01)
-        assert isinstance(asking.exception(), LinkError)
-
-
-def test_cancelling_a_task_ends_its_question_and_its_stream(
-    link: LinkConfig, finger: Finger, examples: dict[str, Any], wait_until: WaitUntil
-) -> None:
-    begun, go = threading.Event(), threading.Event()
-
-    def handler(_: TareRequest) -> Tare:
-        begun.set()
-        go.wait(LIVE_S)
-        tare: Tare = examples["Tare"]
-        return tare
-
-    async def scene(session: Session) -> None:
-        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
-            asking = await _begun(lambda: robot.tare("slow", timeout_s=600.0), begun)
-            asking.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await asking
-
-            async def listen() -> None:
-                async for _ in robot.stream_features("nobody", timeout_s=None):
-                    raise AssertionError
-
-            listening = asyncio.create_task(listen())
-            await asyncio.sleep(0.1)
-            listening.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await listening
-
-    with Session.open(link) as session:
-        session.queryable(endpoints.TARE, handler, sensor="slow")
-        asyncio.run(asyncio.wait_for(scene(session), 3 * LIVE_S))
-        go.set()
-    wait_until(
-        lambda: not [one for one in threading.enumerate() if one.name.startswith("palpate c")],
-        timeout_s=LIVE_S,
-    )
-
-
-def test_a_simulation_reports_into_the_loop_and_is_stopped_with_its_task(
-    link: LinkConfig, wait_until: WaitUntil
-) -> None:
-    """The answering side only knows the caller's token, as the finite-element service does."""
-    gone, begun = threading.Event(), threading.Event()
-
-    def simulate(request: SimulationRequest, answer: Any) -> None:
-        for done in range(3):
-            progress = SimulationProgress(request.request_id, done, 3, 0.1)
-            answer.send(
-                SimulationReply(request.request_id, bytes(32), (), progress=progress, more=True)
-            )
-        if request.request_id == "endless":
-            begun.set()
-            return
-        answer.send(SimulationReply(request.request_id, bytes(32), ()))
-        answer.end()
-
-    async def scene() -> None:
-        loop = asyncio.get_running_loop()
-        steps: list[int] = []
-
-        def on_progress(progress: SimulationProgress) -> None:
-            assert asyncio.get_running_loop() is loop
-            steps.append(progress.steps_done)
-
-        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
-            request = _request()
-            while not steps:
-                with suppress(LinkError):  # the service is not known here yet
-                    await robot.simulate(request, on_progress=on_progress)
-            assert steps == [0, 1, 2]
-            endless = dataclasses.replace(request, request_id="endless")
-            asking = await _begun(lambda: robot.simulate(endless, timeout_s=600.0), begun)
-            asking.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await asking
-            assert await asyncio.to_thread(gone.wait, LIVE_S), "the service hears of it"
-
-    with Session.open(link) as session:
-        session.watch_callers(lambda *_: gone.set() if begun.is_set() else None)
-        session.stream_queryable(endpoints.SIMULATE, simulate, sensor="twin")
-        asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
-
-
-def test_joining_without_a_router_fails_and_may_be_cancelled(
-    free_port: int, wait_until: WaitUntil
-) -> None:
-    async def scene() -> None:
-        with pytest.raises(LinkError, match="no router"):
-            async with AsyncClient(f"tcp/127.0.0.1:{free_port}", timeout_s=0.2):
-                pass
-        joining = asyncio.create_task(
-            AsyncClient(f"tcp/127.0.0.1:{free_port}", timeout_s=1.0).__aenter__()
-        )
-        await asyncio.sleep(0.1)
-        joining.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await joining
-
-    asyncio.run(asyncio.wait_for(scene(), LIVE_S))
-    wait_until(
-        lambda: not [one for one in threading.enumerate() if one.name.startswith("palpate c")],
-        timeout_s=LIVE_S,
-    )

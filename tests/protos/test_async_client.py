@@ -1,0 +1,254 @@
+"""The robot's client for asyncio."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import threading
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from typing import Any, cast
+
+import pytest
+from tests.protos.robot_client import (
+    CALLS,
+    LIVE_S,
+    Finger,
+    WaitUntil,
+    public_names,
+    simulation_request,
+)
+
+from palpate import AsyncClient, Client
+from palpate.bus import Session, endpoints
+from palpate.config import LinkConfig
+from palpate.errors import (
+    ConfigError,
+    LinkError,
+    SensorChanged,
+    StreamTimeout,
+)
+from palpate.messages import (
+    SimulationProgress,
+    SimulationReply,
+    SimulationRequest,
+    Tare,
+    TareRequest,
+)
+
+
+def test_every_method_of_the_client_is_there_for_asyncio() -> None:
+    assert public_names(Client) - {"close"} <= public_names(AsyncClient)
+
+
+@pytest.mark.parametrize("name", ["alive", "features", "tare"])
+def test_an_async_client_whose_session_is_closed_says_so(
+    link: LinkConfig, examples: dict[str, Any], name: str
+) -> None:
+    async def call() -> object:
+        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
+            robot.sync.close()
+            return await cast("Coroutine[Any, Any, object]", CALLS[name](robot, examples))
+
+    with pytest.raises(LinkError, match="closed"):
+        asyncio.run(call())
+
+
+def test_an_async_client_streams_asks_and_leaves_the_loop_free(
+    link: LinkConfig, finger: Finger, examples: dict[str, Any]
+) -> None:
+    async def scene() -> None:
+        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
+            seen: list[int] = []
+            async for estimate in robot.stream_features("finger", max_age_s=LIVE_S):
+                seen.append(estimate.source.sequence)
+                if len(seen) == 3:
+                    break
+            assert seen == sorted(set(seen))
+            estimate = await robot.features("finger", max_age_s=LIVE_S)
+            assert estimate.force.tolist() == examples["FeatureEstimate"].force.tolist()
+            with pytest.raises(LinkError, match="no gateway has a BioTac of this name"):
+                await robot.tare("nobody")
+            with pytest.raises(ConfigError):
+                await robot.features("*")
+            turns = 0
+
+            async def count() -> None:
+                nonlocal turns
+                while True:
+                    await asyncio.sleep(0.005)
+                    turns += 1
+
+            counting = asyncio.create_task(count())
+            with pytest.raises(StreamTimeout):
+                await robot.next_features("nobody", timeout_s=0.5)
+            counting.cancel()
+            assert turns >= 3, "the loop ran while the call waited"
+        with pytest.raises(LinkError, match="async with"):
+            await robot.features("finger")
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
+def test_an_async_stream_says_that_it_is_silent_and_goes_on(
+    link: LinkConfig, finger: Finger
+) -> None:
+    async def scene() -> None:
+        async with (
+            AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot,
+            robot.stream_features("finger", max_age_s=LIVE_S, timeout_s=0.3) as stream,
+        ):
+            await anext(stream)
+            finger.silent = True
+            with pytest.raises(StreamTimeout):
+                [_ async for _ in stream]
+            finger.silent = False
+            while True:
+                try:
+                    await anext(stream)
+                except StreamTimeout:
+                    continue
+                break
+            await stream.aclose()
+            with pytest.raises(StopAsyncIteration):
+                await anext(stream)
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
+def test_an_async_stream_tells_of_another_sensor_though_its_task_is_slow(
+    link: LinkConfig, finger: Finger
+) -> None:
+    async def scene() -> None:
+        async with (
+            AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot,
+            robot.stream_features("finger", max_age_s=LIVE_S) as stream,
+        ):
+            await anext(stream)
+            finger.serial = "BT-OTHER"
+            skipped = stream.counters["skipped"]
+            while stream.counters["skipped"] < skipped + 20:  # enough to push it out
+                await asyncio.sleep(0.05)
+            with pytest.raises(SensorChanged):
+                await anext(stream)
+            assert (await anext(stream)).sensor_serial == "BT-OTHER"
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
+async def _begun(
+    ask: Callable[[], Coroutine[Any, Any, object]], begun: threading.Event
+) -> asyncio.Task[object]:
+    """A question that has reached its service, which may not be known here at first."""
+    while True:
+        asking = asyncio.create_task(ask())
+        while not asking.done():
+            if begun.is_set():
+                return asking
+            await asyncio.sleep(0.01)
+        assert isinstance(asking.exception(), LinkError)
+
+
+def test_cancelling_a_task_ends_its_question_and_its_stream(
+    link: LinkConfig, finger: Finger, examples: dict[str, Any], wait_until: WaitUntil
+) -> None:
+    begun, go = threading.Event(), threading.Event()
+
+    def handler(_: TareRequest) -> Tare:
+        begun.set()
+        go.wait(LIVE_S)
+        tare: Tare = examples["Tare"]
+        return tare
+
+    async def scene(session: Session) -> None:
+        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
+            asking = await _begun(lambda: robot.tare("slow", timeout_s=600.0), begun)
+            asking.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await asking
+
+            async def listen() -> None:
+                async for _ in robot.stream_features("nobody", timeout_s=None):
+                    raise AssertionError
+
+            listening = asyncio.create_task(listen())
+            await asyncio.sleep(0.1)
+            listening.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await listening
+
+    with Session.open(link) as session:
+        session.queryable(endpoints.TARE, handler, sensor="slow")
+        asyncio.run(asyncio.wait_for(scene(session), 3 * LIVE_S))
+        go.set()
+    wait_until(
+        lambda: not [one for one in threading.enumerate() if one.name.startswith("palpate c")],
+        timeout_s=LIVE_S,
+    )
+
+
+def test_a_simulation_reports_into_the_loop_and_is_stopped_with_its_task(
+    link: LinkConfig, wait_until: WaitUntil
+) -> None:
+    """The answering side only knows the caller's token, as the finite-element service does."""
+    gone, begun = threading.Event(), threading.Event()
+
+    def simulate(request: SimulationRequest, answer: Any) -> None:
+        for done in range(3):
+            progress = SimulationProgress(request.request_id, done, 3, 0.1)
+            answer.send(
+                SimulationReply(request.request_id, bytes(32), (), progress=progress, more=True)
+            )
+        if request.request_id == "endless":
+            begun.set()
+            return
+        answer.send(SimulationReply(request.request_id, bytes(32), ()))
+        answer.end()
+
+    async def scene() -> None:
+        loop = asyncio.get_running_loop()
+        steps: list[int] = []
+
+        def on_progress(progress: SimulationProgress) -> None:
+            assert asyncio.get_running_loop() is loop
+            steps.append(progress.steps_done)
+
+        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
+            request = simulation_request()
+            while not steps:
+                with suppress(LinkError):  # the service is not known here yet
+                    await robot.simulate(request, on_progress=on_progress)
+            assert steps == [0, 1, 2]
+            endless = dataclasses.replace(request, request_id="endless")
+            asking = await _begun(lambda: robot.simulate(endless, timeout_s=600.0), begun)
+            asking.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await asking
+            assert await asyncio.to_thread(gone.wait, LIVE_S), "the service hears of it"
+
+    with Session.open(link) as session:
+        session.watch_callers(lambda *_: gone.set() if begun.is_set() else None)
+        session.stream_queryable(endpoints.SIMULATE, simulate, sensor="twin")
+        asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
+def test_joining_without_a_router_fails_and_may_be_cancelled(
+    free_port: int, wait_until: WaitUntil
+) -> None:
+    async def scene() -> None:
+        with pytest.raises(LinkError, match="no router"):
+            async with AsyncClient(f"tcp/127.0.0.1:{free_port}", timeout_s=0.2):
+                pass
+        joining = asyncio.create_task(
+            AsyncClient(f"tcp/127.0.0.1:{free_port}", timeout_s=1.0).__aenter__()
+        )
+        await asyncio.sleep(0.1)
+        joining.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await joining
+
+    asyncio.run(asyncio.wait_for(scene(), LIVE_S))
+    wait_until(
+        lambda: not [one for one in threading.enumerate() if one.name.startswith("palpate c")],
+        timeout_s=LIVE_S,
+    )
