@@ -101,6 +101,16 @@ def _latency() -> str:
             if (load := values.get(f"load.{name}"))
         ),
     )
+    slow = _read("e2e-slow-host")
+    load = slow["load.features"]
+    text += (
+        "\n**Not on every host.** The same command on a host half as fast (its floor has a median "
+        f"of {_ms(slow['e2e.floor']['p50_s'])}), later and with a later commit: p50 "
+        f"{_ms(slow['e2e.palpate']['p50_s'])} and p99 {_ms(slow['e2e.palpate']['p99_s'])}, "
+        f"{slow['e2e.p50_ratio']:.2f} and {slow['e2e.p99_ratio']:.2f} times the floor, so both "
+        f"goals are missed; of 40 fingers {load['lost']:,} of {load['published']:,} frames were "
+        "lost. Whether the host or the commit is the cause was not measured.\n"
+    )
     command = f"palpate bench e2e --runs {len(values['e2e.runs'])}"
     return _section("Latency beside a bare floor", command, values, text)
 
