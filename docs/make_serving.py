@@ -109,10 +109,22 @@ def _latency() -> str:
         f"{_ms(slow['e2e.palpate']['p50_s'])} and p99 {_ms(slow['e2e.palpate']['p99_s'])}, "
         f"{slow['e2e.p50_ratio']:.2f} and {slow['e2e.p99_ratio']:.2f} times the floor, so both "
         f"goals are missed; of 40 fingers {load['lost']:,} of {load['published']:,} frames were "
-        "lost. Whether the host or the commit is the cause was not measured.\n"
+        "lost. The host explains most of it: there "
+        f"`{slow['e2e.compared']['command']}` ran twice with the commit before that day's changes "
+        f"({_compared(slow, '8e68281')} the floor) and twice with the one after them "
+        f"({_compared(slow, '83d57ee')} the floor), both with the later benchmark.\n"
     )
     command = f"palpate bench e2e --runs {len(values['e2e.runs'])}"
     return _section("Latency beside a bare floor", command, values, text)
+
+
+def _compared(values: dict[str, Any], commit: str) -> str:
+    """The median latencies of a commit's runs, and their ratios to the floor."""
+    runs = values["e2e.compared"][commit]
+    return (
+        f"p50 {' and '.join(_ms(run['p50_s']) for run in runs)}, "
+        f"{' and '.join(format(run['p50_ratio'], '.2f') for run in runs)} times"
+    )
 
 
 def _restarts() -> str:
