@@ -215,8 +215,11 @@ $(VENV)/.demo: $(VENV)/.made pyproject.toml
 # torch goes first, alone, and by exact version: `==2.13.0` is also met by the CPU build
 # `2.13.0+cpu` where the index offers one. Any looser request takes the newest release instead, and
 # on Linux that brings gigabytes of CUDA libraries. tests/house compares this pin with pyproject.toml.
+# rfc3987-syntax, which comes with cyclonedx-bom, parses a grammar whenever Ray is imported (through
+# jsonschema): 1 to 2 s in each process of a cluster. It checks IRIs, and nothing here has any.
 $(VENV)/.dev: $(VENV)/.made pyproject.toml
 	@echo "palpate: installing everything into $(VENV) (torch and the developer's tools), 3-8 minutes"
 	@$(pip_install) '$(TORCH)' | $(show)
 	@$(pip_install) -e '.[all,cluster,dev,docs]' | $(show)
+	@$(BIN)/python -m pip uninstall --disable-pip-version-check --yes -qq rfc3987-syntax
 	@touch $(VENV)/.demo $@
