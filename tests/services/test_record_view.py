@@ -12,7 +12,7 @@ import pytest
 
 from palpate.bus.topics import ELECTRODES, ROBOT_POSE, sensor_key
 from palpate.errors import RecordingError
-from palpate.files.record import RecordItem
+from palpate.files.record import RecordItem, summarise
 from palpate.files.record_writer import RecordWriter
 from palpate.messages import ElectrodeFrame, Pose, RobotPoseFrame
 from palpate_services.viewer import record_view
@@ -101,3 +101,14 @@ def test_a_full_disk_is_told(record: Path, tmp_path: Path) -> None:
         assert list(disk.iterdir()) == []
     finally:
         subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize("content", [b"", b"%PDF-1.4\n" * 300, b"\x89MCAP"])
+def test_what_is_no_record_is_not_called_a_damaged_one(tmp_path: Path, content: bytes) -> None:
+    """Nothing can be recovered of it."""
+    path = tmp_path / "junk.mcap"
+    path.write_bytes(content)
+    for look in (review, summarise):
+        with pytest.raises(RecordingError, match=r"junk\.mcap is no MCAP file") as caught:
+            look(path)
+        assert caught.value.remedy == "give a record written by palpate"
