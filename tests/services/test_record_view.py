@@ -7,12 +7,11 @@ import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from palpate.bus.topics import ELECTRODES, ROBOT_POSE, sensor_key
 from palpate.errors import RecordingError
-from palpate.files.record import RecordItem, summarise
+from palpate.files.record import RecordItem, read_record, summarise
 from palpate.files.record_writer import RecordWriter
 from palpate.messages import ElectrodeFrame, Pose, RobotPoseFrame
 from palpate_services.viewer import record_view
@@ -62,10 +61,10 @@ def test_an_interrupted_review_leaves_the_view_that_is_there(
     record: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     view = review(record)
-    whole, read = view.read_bytes(), record_view.read_record
+    whole = view.read_bytes()
 
     def interrupted(path: Path) -> Iterator[RecordItem]:
-        for count, item in enumerate(read(path)):
+        for count, item in enumerate(read_record(path)):
             if count == 3000:
                 raise KeyboardInterrupt
             yield item
@@ -80,7 +79,7 @@ def test_an_interrupted_review_leaves_the_view_that_is_there(
 def test_a_record_with_nothing_to_show_is_named(make_frame: Frames, tmp_path: Path) -> None:
     path = tmp_path / "robot.mcap"
     with RecordWriter(path) as writer:
-        pose = RobotPoseFrame("arm", 1, 1, Pose(np.zeros(3), np.array([1.0, 0, 0, 0])))
+        pose = RobotPoseFrame("arm", 1, 1, Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
         key = sensor_key("lab", "arm", ROBOT_POSE.name)
         writer.write(key, ROBOT_POSE.codec.schema, ROBOT_POSE.codec.encode(pose), log_time_ns=1)
     with pytest.raises(RecordingError, match="holds nothing that a view shows"):
