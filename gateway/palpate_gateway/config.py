@@ -54,7 +54,8 @@ class GatewayConfig(StrictConfig):
         pace: Recordings at their own pace (stamped with the present time) or as fast as possible
             (stamps as recorded, nothing is ever dropped).
         wait_for: Services that must be ready before a fast recording starts.
-        exit_at_end: End the process when every source has ended.
+        exit_at_end: End the process when every source has ended; of a fast recording, when all
+            services have read it.
         core: The processor core that the process is bound to: its number, ``idlest`` = the one with
             the least load at the start, or ``any`` = not bound. A recording as fast as possible is
             never bound.

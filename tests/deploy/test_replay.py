@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import json
 import subprocess
@@ -16,10 +17,11 @@ from tests.gateway.ros_fakes import BEGAN_NS, hand_fields, make_bag, write_bag
 
 from palpate.bus import Session
 from palpate.bus.topics import ELECTRODES, FEATURES
-from palpate.files.record import read_record
+from palpate.errors import RecordingError
+from palpate.files.record import RecordItem, read_record
 from palpate.messages import Status
 from palpate.ros.layouts import BIOTAC_HAND, Dialect, encode
-from palpate_deploy.diagnose.replay import replay, replay_profile
+from palpate_deploy.diagnose.replay import ReplayAccount, replay, replay_profile, run_replay
 from palpate_deploy.station.status import ask_status
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -37,6 +39,12 @@ def _replay(palpate: Palpate, file: Path, out: Path, *more: str) -> dict[str, An
     assert account["lossless"]
     assert len(account["records"]) == 1
     return account
+
+
+def _readable(record: Path) -> Iterator[RecordItem]:
+    """What stands before the damage of a record."""
+    with contextlib.suppress(RecordingError):
+        yield from read_record(record)
 
 
 def _estimates(account: dict[str, Any]) -> list[bytes]:
@@ -190,9 +198,35 @@ def test_damaged_record(
 ) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(virtual_record.read_bytes()[:-8000])
+    readable = Counter(item.address.topic for item in _readable(cut))
     result = palpate("replay", cut, "--out", tmp_path / "out", "--no-rrd", "--json")
     assert result.returncode == 3
     assert "cut.mcap" in result.stderr
+    account = json.loads(result.stdout)
+    assert account["lossless"]
+    assert account["recorded"]["electrodes"] == account["frames"] == readable["electrodes"]
+
+
+def test_what_is_lost_of_a_damaged_record_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, bundle: str
+) -> None:
+    """Beside the damage, which alone would pass for the reason."""
+    account = ReplayAccount(
+        tmp_path / "cut.mcap",
+        gateway={"frames_published": 100},
+        features={"estimates_published": 90},
+        recorded={"electrodes": 90, "features": 90},
+        error=RecordingError("cut.mcap is damaged", remedy="recover it"),
+        exit_status=3,
+        counted=True,
+    )
+    monkeypatch.setattr("palpate_deploy.diagnose.replay.replay", lambda *_, **__: account)
+    monkeypatch.setattr("palpate_deploy.diagnose.replay.replay_profile", lambda *_, **__: None)
+    status = run_replay(account.file, "fast", tmp_path, "features-virtual", rrd=False, as_json=True)
+    assert status == 3
+    told = capsys.readouterr().err
+    assert "cut.mcap is damaged" in told
+    assert "100 frames published, 90 recorded" in told
 
 
 def test_recorded_pace(palpate: Palpate, text_log: Path, bundle: str, tmp_path: Path) -> None:

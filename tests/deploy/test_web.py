@@ -10,7 +10,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from typing import Any
 
 import pytest
@@ -385,6 +385,75 @@ def test_slow_and_broken_clients_do_not_hold_up_others(
         finally:
             for one in held:
                 one.close()
+
+
+@contextmanager
+def serving_a_large_file(port: int) -> Iterator[Callable[[], int]]:
+    """The server alone, with a viewer's file of 14 MB; how it answers a question for its status."""
+    drawn = Drawn()
+    drawn.find = lambda name: b"w" * 14_000_000  # type: ignore[method-assign]
+    config = WebConfig(listen=f"127.0.0.1:{port}")
+
+    def status() -> int:
+        with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)) as to:
+            to.request("GET", "/api/status")
+            return to.getresponse().status
+
+    with web._serving(made(drawn), config):
+        yield status
+
+
+def not_reading(port: int, *, questions: int) -> socket.socket:
+    """A connection that asks for the large file and takes next to nothing of it."""
+    held = socket.socket()
+    held.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    held.settimeout(PATIENCE_S)
+    held.connect(("127.0.0.1", port))
+    held.sendall(b"GET /viewer/re_viewer_bg.wasm HTTP/1.1\r\nHost: localhost\r\n\r\n" * questions)
+    return held
+
+
+def test_answers_that_nobody_reads_keep_no_thread(
+    free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many were asked for in one breath, and however long they may lie there."""
+    monkeypatch.setattr(web, "IDLE_S", 3600)
+    with ExitStack() as held, serving_a_large_file(free_port) as status:
+        for _ in range(2 * web._THREADS):
+            held.enter_context(not_reading(free_port, questions=6))
+        assert [status() for _ in range(5)] == [200] * 5
+
+
+def test_connections_whose_answer_nobody_reads_are_closed(
+    free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(web, "CONNECTIONS_MOST", 5)
+    monkeypatch.setattr(web, "IDLE_S", 1)
+    with ExitStack() as held, serving_a_large_file(free_port) as status:
+        for _ in range(20):
+            held.enter_context(not_reading(free_port, questions=1))
+        assert status() == 200
+
+
+def test_a_name_of_two_addresses_is_served_and_stopped(
+    free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    resolve, addresses = socket.getaddrinfo, ("127.0.0.1", "127.0.0.2")
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            socket,
+            "getaddrinfo",
+            lambda _, *rest: [one for host in addresses for one in resolve(host, *rest)],
+        )
+        serving = web._serving(made(), WebConfig(listen=f"localhost:{free_port}"))
+        serving.__enter__()
+    try:
+        for address in addresses:
+            with closing(http.client.HTTPConnection(address, free_port, timeout=PATIENCE_S)) as to:
+                to.request("GET", "/api/status")
+                assert to.getresponse().status == 200
+    finally:
+        serving.__exit__(None, None, None)
 
 
 def test_more_connections_than_there_may_be_wait_and_are_served_later(

@@ -289,6 +289,8 @@ def make(
     def build(parameters: FingertipParameters, on_fraction: OnFraction) -> FakeTip:
         if broken == "dies":
             os._exit(9)
+        if broken == "hangs":
+            time.sleep(3600)
         if broken:
             raise SimulationError(broken, remedy="mend it")
         for k in range(20):

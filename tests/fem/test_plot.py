@@ -166,8 +166,9 @@ def test_what_cannot_be_drawn_is_refused(
     with pytest.raises(DatasetError, match="no trajectory"):
         plot_overview([], path)
     path.mkdir()
-    with pytest.raises(StoreDiskError, match="cannot write"):
+    with pytest.raises(StoreDiskError, match="cannot write") as caught:
         plot_step(tip, press, path)
+    assert "kept" not in caught.value.remedy, "nothing is kept but in a store"
 
 
 def test_overview_counts_outcomes(press: IndentationResult, tmp_path: Path) -> None:

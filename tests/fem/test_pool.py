@@ -68,6 +68,9 @@ class FakeProcess:
             self.end()
         self.cancelled.add(job_id)
 
+    def end_if_stuck(self) -> None:
+        return
+
     def kill(self) -> None:
         return
 

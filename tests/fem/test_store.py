@@ -257,6 +257,7 @@ except StoreDiskError as error:
         [sys.executable, "-c", program, path, single], capture_output=True, text=True, check=False
     )
     assert "cannot write" in run.stdout, run.stderr
+    assert "kept" not in run.stdout, "an export begins anew"
     assert run.returncode == 0, run.stderr
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 

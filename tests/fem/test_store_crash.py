@@ -211,6 +211,7 @@ def test_disk_error_keeps_what_was_finished(
             with pytest.raises(StoreDiskError, match=words) as caught:
                 store.write("press/1", press)
         assert "press/1.h5" in str(caught.value)
+        assert "what was finished before is kept" in caught.value.remedy
         assert store.done() == {"press/0"}
         assert not list(path.rglob("*.part")), "half a file takes no space on a full disk"
         store.write("press/1", press)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import queue
 import signal
 import subprocess
 import sys
@@ -23,8 +24,9 @@ from palpate_fem.indenter.approach import OuterSurface
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.indenter.distance import signed_distance
 from palpate_fem.result import IndentationOutcome, IndentationResult
+from palpate_fem.service import pool
 from palpate_fem.service.batch import BatchReport, OnReport, SimulationBatch, sweep_into_store
-from palpate_fem.service.jobs import WorkerSetup
+from palpate_fem.service.jobs import JobEvent, JobStarted, Pressurising, WorkerSetup
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.trajectory import PlannedIndentation
 
@@ -96,6 +98,30 @@ def test_what_fails_does_not_stop_the_others(kind: str, said: str) -> None:
 def test_a_solver_that_does_not_start_ends_the_sweep() -> None:
     with pytest.raises(RemoteError, match="no such mesh"):
         run(fakes.QUICK, 2, options={"broken": "no such mesh"})
+
+
+def test_a_solver_that_hangs_before_it_is_ready_ends_the_sweep(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pool, "START_S", 0.5)
+    monkeypatch.setattr(pool, "_PAUSE_S", 0.0)
+    with batch_of(fakes.QUICK, options={"broken": "hangs"}) as batch:
+        with pytest.raises(RemoteError, match=r"silent for 0\.5 s before it was ready"):
+            batch.fingertip(threading.Event())
+
+
+def test_a_solver_that_starts_slowly_says_that_it_lives() -> None:
+    events: queue.SimpleQueue[JobEvent] = queue.SimpleQueue()
+    setup = WorkerSetup("fem_fakes:make", {"fill_s": 1.0}, FingertipParameters(), 1)
+    worker = pool.WorkerProcess(setup, 1, lambda _, event: events.put(event), lambda _: None)
+    try:
+        assert isinstance(events.get(timeout=60.0), Pressurising)
+        while isinstance(last := events.get(timeout=60.0), Pressurising):
+            pass
+        assert isinstance(last, JobStarted)
+    finally:
+        worker.kill()
+        worker.join()
 
 
 def run_batch(

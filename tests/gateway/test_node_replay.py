@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -13,12 +14,13 @@ from typing import Any
 import pytest
 from tests.gateway.ros_fakes import BEGAN_NS, hand_fields, write_bag
 
+from palpate.bus import Session, endpoints
 from palpate.bus.topics import TOPICS
 from palpate.codec import TARE
 from palpate.errors import RecordingError, RemoteError
 from palpate.files.record import read_record
 from palpate.files.record_writer import RecordWriter
-from palpate.messages import ElectrodeFrame, Origin, ServiceState
+from palpate.messages import ElectrodeFrame, Origin, ServiceRequest, ServiceState, Status
 from palpate.ros.layouts import BIOTAC_HAND, encode
 
 PATIENCE_S = 30.0
@@ -72,6 +74,29 @@ def test_two_fast_replays_give_the_same_bytes(
             runs.append(electrodes)
     assert runs[0] == runs[1]
     assert len(runs[0]) == 80
+
+
+def test_it_does_not_leave_before_all_have_read(
+    bus: Any, log: Callable[..., Any], tmp_path: Path
+) -> None:
+    """A service that reads slowly answers late: what it has not read would be lost."""
+    asked, read = threading.Event(), threading.Event()
+
+    def answer(_: ServiceRequest) -> Status:
+        asked.set()
+        assert read.wait(PATIENCE_S)
+        return Status("features", "features", ServiceState.READY, 1, 1, 1.0, "1")
+
+    path = log(80).write(tmp_path / "a.btd")
+    with Session.open(bus.link) as slow, bus.consumer():
+        slow.queryable(endpoints.STATUS, answer, service="features", instance="features")
+        with bus.gateway(replay(path, exit_at_end=True, linger_s=2.5)) as running:
+            assert asked.wait(PATIENCE_S)
+            assert running.thread.is_alive()
+            read.set()
+            running.thread.join(PATIENCE_S)
+            assert not running.thread.is_alive()
+            assert running.error is None
 
 
 def test_a_record_keeps_the_session_of_its_run(

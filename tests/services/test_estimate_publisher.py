@@ -21,7 +21,7 @@ from palpate.config import LinkConfig
 from palpate.health import Health
 from palpate.messages import ElectrodeFrame, FeatureEstimate, Origin, StageTimings
 from palpate_services.config import FeaturesServiceConfig
-from palpate_services.inference import loop
+from palpate_services.inference import input_report, loop
 from palpate_services.inference.estimates import EstimateRefusal, Estimation, Sample
 from palpate_services.inference.loop import EstimatePublisher, ServiceRoute
 
@@ -46,6 +46,7 @@ class Station:
         self.refused: EstimateRefusal | None = None
         self.batches: list[int] = []
         self.closed: list[str] = []
+        self.troubles: list[str] = []
         # By sensor; each is a bundle of its own.
         self.runtimes: dict[str, Any] = {}
         self.runtime = self.bundle()
@@ -67,7 +68,9 @@ class Station:
     def bundle(self) -> Any:
         return type("Runtime", (), {"label": "any:1", "run_all": staticmethod(self.run_all)})()
 
-    def make(self, *, rate_hz: float | None = None, **config: Any) -> EstimatePublisher[Any, Any]:
+    def make(
+        self, *, rate_hz: float | None = None, duty: Any = None, **config: Any
+    ) -> EstimatePublisher[Any, Any]:
         def publisher(topic: object, *, sensor: str, lossless: bool) -> object:
             assert topic is FEATURES
             assert not lossless
@@ -87,6 +90,7 @@ class Station:
             gauge=self.gauges.__setitem__,
             set_gauges=lambda source, gauges: setattr(self, "of_estimates", gauges),
             set_sensors=lambda sensors: setattr(self, "sensors", sensors),
+            fail=lambda error: self.troubles.append(str(error)),
         )
         given: Any = {"bundle": "any", "max_age_s": None, "accept_replayed": True, **config}
         return EstimatePublisher(
@@ -99,6 +103,7 @@ class Station:
             ),  # type: ignore[arg-type]
             Estimation(self.sample, lambda frame, *_: frame.stamp.sequence),
             rate_hz=rate_hz,
+            duty=duty,
         )
 
 
@@ -147,6 +152,31 @@ def test_a_message_without_an_estimate_leaves_its_period_to_the_next(
     publisher.take([came(2, START_NS + MS)])
     assert station.put == [("finger", 2)]
     assert publisher.counters["untared"] == 1
+
+
+def test_a_standby_that_refuses_some_messages_is_in_no_trouble(
+    station: Station, came: Came, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is it blind to a sensor of which it refuses all."""
+    seconds = SimpleNamespace(monotonic=lambda: 1e-9 * station.now_ns)
+    monkeypatch.setattr(input_report, "time", seconds)
+    duty = SimpleNamespace(
+        take=lambda *_: None, holds=lambda _: False, report=lambda: None, release=lambda _: None
+    )
+    publisher = station.make(duty=duty)
+
+    def run(refused_every: int) -> None:
+        for k in range(300):
+            station.now_ns += 10 * MS
+            station.refused = EstimateRefusal.STALE if k % refused_every == 0 else None
+            publisher.take([came(k, station.now_ns)])
+            publisher.report()
+
+    run(refused_every=20)
+    assert (station.put, station.troubles) == ([], [])
+    assert publisher.counters == {"frames_received": 300, "standby": 285, "stale": 15}
+    run(refused_every=1)
+    assert "'finger' is refused (stale)" in station.troubles[-1]
 
 
 def test_a_rehearsal_has_no_effect(station: Station, came: Came) -> None:

@@ -213,8 +213,24 @@ def test_folder_that_is_no_store(tmp_path: Path) -> None:
 
 def test_view_that_cannot_be_written(store: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    with pytest.raises(DatasetError, match=r"cannot write the view.*not affected"):
-        review_simulations(store, tmp_path / "none" / "view.rrd")
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(DatasetError, match=r"cannot write .*view\.rrd"):
+        review_simulations(store, tmp_path / "file" / "view.rrd")
+
+
+def test_an_interrupted_review_leaves_the_view_that_is_there(store: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    view = tmp_path / "view.rrd"
+    view.write_bytes(b"good")
+
+    def interrupted(drawn: int, total: int) -> None:
+        if drawn == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        review_simulations(store, view, progress=interrupted)
+    assert view.read_bytes() == b"good"
+    assert sorted(tmp_path.iterdir()) == [store, view]
 
 
 def test_stores_are_told_from_records(store: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -67,10 +68,15 @@ class Finger:
         )
         self._session = session
 
+    def send(self, **frame: Any) -> bool:
+        """Send a frame."""
+        self.sequence += 1
+        self._frames.put(self._make(self.sequence, **frame))
+        return True
+
     def touch(self) -> FeatureEstimate | None:
         """Send a frame; its estimate, if one comes."""
-        self.sequence += 1
-        self._frames.put(self._make(self.sequence))
+        self.send()
         try:
             while True:
                 found = self.estimates.next(0.5).message
@@ -136,6 +142,30 @@ def test_one_publishes_and_the_other_takes_over(
         # It does not give the sensor back to one that comes later.
         with replica("features-a", bundle):
             until(lambda: finger.touch() is not None and stood_by(finger, "features-a") > 0)
+
+
+def test_a_standby_says_so_again_after_a_trouble_and_afterwards_what_it_serves(
+    replica: Replica, make_bundle: Callable[..., Path], finger: Finger, until: Until
+) -> None:
+    bundle = make_bundle()
+    with ExitStack() as first:
+        first.enter_context(replica("features-a", bundle))
+        finger.touch_until_estimated()
+        with replica("features-b", bundle):
+
+            def said() -> tuple[ServiceState, str]:
+                found = finger.status("features-b")
+                return found.state, found.message
+
+            ready = ServiceState.READY
+            until(lambda: finger.touch() is not None and "standby for finger" in said()[1])
+            until(lambda: finger.send(validity=1) and said()[0] is ServiceState.DEGRADED)
+            until(lambda: finger.touch() is not None and said()[0] is ready)
+            assert "standby for finger: features-a" in said()[1]
+            first.close()
+            finger.touch_until_estimated()
+            until(lambda: finger.touch() is not None and "standby" not in said()[1])
+            assert said() == (ready, "serving test:1")
 
 
 def test_a_standby_with_another_bundle_says_so(

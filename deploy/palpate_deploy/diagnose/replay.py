@@ -24,7 +24,7 @@ from palpate.bus import Delivery, Session, Subscriber
 from palpate.bus.topics import ELECTRODES, FEATURES, STATUS
 from palpate.errors import LinkError, PalpateError, RecordingError, printable
 from palpate.files.record import summarise
-from palpate.messages import ServiceState, Status
+from palpate.messages import SensorState, ServiceState, Status
 from palpate_deploy.diagnose.records import viewer_command
 from palpate_deploy.station.host import join, private_profile
 from palpate_deploy.station.logs import DEVICE, FAILED, print_error
@@ -177,7 +177,9 @@ _POLL_S = 0.1
 _JOIN_S = 60.0
 _SETTLED_S = 20.0
 _LINGER_S = 1.0
-_ENDED = (ServiceState.FINISHED, ServiceState.DEGRADED)
+_LEASE_S = 60.0
+"""Of its links [s]: on a busy host one that waits for a slow reader is silent for seconds, and a
+link that is given up loses what is on its way."""
 
 
 def run_replay(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool, as_json: bool) -> int:
@@ -200,16 +202,12 @@ def run_replay(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool, as_j
         print_account(account)
     if account.error is not None:
         print_error(account.error)
+        if account.published and pace == "fast":
+            _print_problems(account)
         return DEVICE if account.exit_status == DEVICE else FAILED
     # At the recorded pace a slow host may drop frames, as it would live; they are only counted.
     if account.problems and (pace == "fast" or not account.estimated):
-        for problem in account.problems:
-            print_error(
-                LinkError(
-                    problem,
-                    remedy="see the counters above, and report it: a replay must be lossless",
-                )
-            )
+        _print_problems(account)
         return FAILED
     if account.dropped:
         print_error(
@@ -223,6 +221,16 @@ def run_replay(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool, as_j
     return 0
 
 
+def _print_problems(account: ReplayAccount) -> None:
+    for problem in account.problems:
+        print_error(
+            LinkError(
+                problem,
+                remedy="see the counters above, and report it: a replay must be lossless",
+            )
+        )
+
+
 def replay_profile(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool) -> Profile:
     """The profile of a replay, with its values checked."""
     fast = pace == "fast"
@@ -230,6 +238,7 @@ def replay_profile(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool) 
     return private_profile(
         "replay",
         gateway={"pace": pace, "sensors": sensors_of(file), "linger_s": _LINGER_S},
+        link={"lease_s": _LEASE_S},
         features={"bundle": bundle, "delivery": delivery, "accept_replayed": True},
         recorder={"out": str(out), "delivery": "every" if fast else "queue", "rrd": rrd},
     )
@@ -328,7 +337,7 @@ def _follow(
     children: FiniteRun, session: Session, account: ReplayAccount, bar: Progress, task: Any
 ) -> int:
     """Update the counters until gateway and consumers have ended; the gateway's exit status."""
-    settled_by = float("inf")
+    settled_by, counted_ns = float("inf"), 0
     # An answer may take longer than the gateway stays after its last frame, so it is listened to.
     told = session.subscriber(STATUS, service="gateway", delivery=Delivery.QUEUE)
     while True:
@@ -337,25 +346,32 @@ def _follow(
         statuses = {status.service: status for status in ask_status(session)}
         counters = {service: dict(status.counters) for service, status in statuses.items()}
         for status in (*_waiting(told), *statuses.values()):
-            if status.service == "gateway" and not account.counted:
+            if status.service == "gateway" and status.monotonic_ns > counted_ns:
+                counted_ns = status.monotonic_ns
                 account.gateway = dict(status.counters)
-                account.counted = status.state is ServiceState.FINISHED
+                account.counted = _has_ended(status)
         account.features = counters.get("features", account.features)
         frames = account.published
         bar.update(task, completed=frames, frames=frames)
         # The gateway ends before its last frames are estimated and recorded; what is still missing
         # after the wait is reported as a loss.
-        if exit_status is not None or (
-            "gateway" in statuses and statuses["gateway"].state in _ENDED
-        ):
+        if exit_status is not None:
             settled_by = min(settled_by, time.monotonic() + _SETTLED_S)
             recorded = counters.get("recorder", {}).get("recorded_electrodes", 0)
             counted = account.counted or bool(exit_status)
             settled = counted and min(account.answered, recorded) >= frames
-            if exit_status is not None and (settled or time.monotonic() > settled_by):
+            if settled or time.monotonic() > settled_by:
                 bar.update(task, total=max(frames, 1), completed=max(frames, 1), frames=frames)
                 return exit_status
         time.sleep(_POLL_S)
+
+
+def _has_ended(gateway: Status) -> bool:
+    """Whether all sources have ended, one perhaps by damage: its counters are those at the end."""
+    if gateway.state is ServiceState.FINISHED:
+        return True
+    ended = [one.name for one in gateway.sensor_states if one.state is SensorState.ENDED]
+    return bool(ended) and len(ended) == len(gateway.sensors)
 
 
 def _waiting(statuses: Subscriber[Status]) -> Iterator[Status]:

@@ -64,7 +64,9 @@ def private_profile(name: str, **tables: Mapping[str, Any]) -> Profile:
     """
     here = (free_endpoint(),)
     own = {"models": {"state": str(state_folder() / "private")}, **tables}
-    return changed(load_profile(name), router={"listen": here}, link={"connect": here}, **own)
+    link = {"connect": here, **tables.get("link", {})}
+    own |= {"link": link}
+    return changed(load_profile(name), router={"listen": here}, **own)
 
 
 def join(profile: Profile, *, wait_s: float, role: Role = Role.SERVICE) -> Session:

@@ -21,7 +21,8 @@ HANG_S = 120.0
 """Longest time between two sweeps of slots [s]; they take seconds."""
 
 START_S = 900.0
-"""The same before a process is ready [s]: kernels are compiled until then, which takes minutes."""
+"""The same before a process, a worker's too, is ready [s]: kernels are compiled until then, which
+takes minutes."""
 
 ON_CLUSTER = ("cuda", "cpu")
 """Devices of a cluster: each of its GPUs, or for tests its CPUs."""

@@ -23,6 +23,7 @@ from palpate.process import Closing
 from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome
 from palpate_fem.service.channel import ChildProcess
+from palpate_fem.service.device_process import START_S
 from palpate_fem.service.fingertips import without_friction
 from palpate_fem.service.jobs import (
     CancelJob,
@@ -77,11 +78,14 @@ class WorkerProcess(ChildProcess):
         on_gone: Callable[[WorkerProcess], None],
     ) -> None:
         self.state = WorkerState.STARTING
+        self._on_event, self._hung = on_event, False
+        self._turns = Turns()
+        self._turns.next(START_S)
         super().__init__(
             "palpate_fem.service.worker",
             setup,
             threads=threads,
-            on_message=on_event,
+            on_message=WorkerProcess._on_message_of_worker,
             on_gone=on_gone,
         )
 
@@ -93,6 +97,23 @@ class WorkerProcess(ChildProcess):
     def cancel(self, job_id: str) -> None:
         """Ask it to stop a job."""
         self.send(CancelJob(job_id))
+
+    def end_if_stuck(self) -> None:
+        """End it if it starts and has been silent for too long; to be asked at every turn."""
+        late = self._turns.are_late()
+        if late and self.state is WorkerState.STARTING and not self._hung:
+            self._hung = True
+            self.kill()
+
+    def how_it_ended(self) -> str:
+        """See ``ChildProcess.how_it_ended``."""
+        if self._hung:
+            return f"was ended as it had been silent for {START_S:g} s"
+        return super().how_it_ended()
+
+    def _on_message_of_worker(self, event: JobEvent) -> None:
+        self._turns.next(START_S)
+        self._on_event(self, event)
 
 
 @dataclass(slots=True, eq=False)
@@ -406,6 +427,7 @@ class WorkerPool(Closing):
                 for task in late:
                     self._waiting.remove(task)
                 hung = [worker for worker, task in self._running.items() if task.overdue <= now]
+                workers = list(self._workers)
                 hopeless = list(self._waiting) if self.broken else []
                 for task in hopeless:
                     self._waiting.remove(task)
@@ -416,6 +438,8 @@ class WorkerPool(Closing):
                 )
             for worker in hung:
                 worker.kill()
+            for worker in workers:
+                worker.end_if_stuck()
             for task in hopeless:
                 assert self.broken is not None
                 self._finish(task, JobFailed.of(self.broken))

@@ -44,6 +44,7 @@ class Worker:
         self._channel = channel
         self._jobs: queue.SimpleQueue[SimulationJob] = queue.SimpleQueue()
         self._cancelled: set[str] = set()
+        self._reported = -math.inf
 
     def run(self) -> None:
         """Serve until the other end is closed."""
@@ -51,7 +52,7 @@ class Worker:
         threading.Thread(target=self._listen, daemon=True).start()
         try:
             tips = FingertipCache(load_factory(setup.factory)(**setup.options), setup.keep)
-            tips.get(setup.warm, lambda _: None)
+            tips.get(setup.warm, self._tell)  # a sign of life, too
         except Exception as error:
             self._report(JobFailed.of(error))
             if isinstance(error, PalpateError):
@@ -74,7 +75,6 @@ class Worker:
 
     def _solve(self, job: SimulationJob, tips: FingertipCache) -> JobEnded | JobFailed:
         deadline = time.monotonic() + job.deadline_s
-        reported = -math.inf
 
         def should_stop() -> IndentationOutcome | None:
             if job.id in self._cancelled:
@@ -82,12 +82,9 @@ class Worker:
             return IndentationOutcome.DEADLINE if time.monotonic() > deadline else None
 
         def on_fraction(fraction: float) -> None:
-            nonlocal reported
             if should_stop() is not None:
                 raise _Stopped
-            if time.monotonic() - reported > _REPORT_EVERY_S:
-                reported = time.monotonic()
-                self._report(Pressurising(fraction))
+            self._tell(fraction)
 
         try:
             tip = tips.get(job.parameters, on_fraction)
@@ -111,6 +108,12 @@ class Worker:
         finally:
             self._cancelled.clear()  # also of what came too late for an earlier job
         return JobEnded(done.outcome, done.reason, done.travel_m, done.seconds)
+
+    def _tell(self, fraction: float) -> None:
+        """Report how much of the fluid is filled in."""
+        if time.monotonic() - self._reported > _REPORT_EVERY_S:
+            self._reported = time.monotonic()
+            self._report(Pressurising(fraction))
 
     def _report(self, event: JobEvent) -> None:
         try:

@@ -12,6 +12,7 @@ import os
 from pathlib import Path
 
 from palpate.errors import DatasetError, ErrorCode
+from palpate.files.simulation_store import SUFFIX
 from palpate.process import Closing
 
 PART = ".part"
@@ -24,7 +25,7 @@ class StoreTakenError(DatasetError):
 
 
 class StoreDiskError(DatasetError):
-    """The disk is full or refuses; what was finished before is kept."""
+    """The disk is full or refuses; what a store holds is kept."""
 
     code = ErrorCode.DISK
 
@@ -37,9 +38,11 @@ def disk_error(path: Path, error: OSError) -> StoreDiskError:
     """The error for a file that cannot be written."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     remedy = "free some space" if full else "check the folder's rights and that its disk is there"
+    in_store = any(folder.suffix == SUFFIX for folder in (path, *path.parents))
+    kept = ": what was finished before is kept" if in_store else ""
     return StoreDiskError(
         f"cannot write {path}: {error.strerror or error}",
-        remedy=f"{remedy} and run the same command again: what was finished before is kept",
+        remedy=f"{remedy} and run the same command again{kept}",
     )
 
 

@@ -11,11 +11,12 @@ from functools import partial
 
 from palpate.bus import Presence, Session, endpoints
 from palpate.bus.topics import ELECTRODES, FIELD_TRUTH, POSE, TARE, WRENCH
+from palpate.bus.zenoh_session import LOSSLESS_STALL_S
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, PalpateError
+from palpate.errors import ConfigError, PalpateError, StreamTimeout
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import LIMIT_S, beat
-from palpate.messages import ServiceState
+from palpate.messages import ServiceRequest, ServiceState
 from palpate.process import avoid_pauses
 from palpate_gateway.clock.stamps import PacedStart, new_session_id
 from palpate_gateway.clock.wall_clock import WallClock, wall_discipline
@@ -37,6 +38,7 @@ SERVICE = "gateway"
 
 _POLL_S = 0.2
 _JOIN_S = 2.0
+_ANSWER_S = 2.0
 _SETTLE_S = 0.3
 """Wait between a consumer's presence and the first frame of a lossless replay [s]: its subscription
 may arrive after its presence, and a frame before the subscription would be lost."""
@@ -202,11 +204,26 @@ def _serve(
             if config.exit_at_end:
                 beat(config.linger_s + LIMIT_S)
                 stop.wait(config.linger_s)
+                if config.pace == "fast":
+                    _await_readers(session, stop)
                 for worker in workers:
                     if worker.error is not None:
                         raise worker.error
                 return
         stop.wait(_POLL_S)
+
+
+def _await_readers(session: Session, stop: threading.Event) -> None:
+    """Wait until every process has read what was sent to it: a closed connection loses the rest.
+
+    Connections keep order, so that whoever answers a question has read all before it.
+    """
+    until_s = time.monotonic() + LOSSLESS_STALL_S
+    while not stop.is_set() and time.monotonic() < until_s:
+        beat(_ANSWER_S + LIMIT_S)
+        answers = session.query_all(endpoints.STATUS, ServiceRequest(), timeout_s=_ANSWER_S)
+        if not any(isinstance(answer, StreamTimeout) for answer in answers):
+            return
 
 
 def _beat_for(workers: list[SensorWorker]) -> None:

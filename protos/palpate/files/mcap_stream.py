@@ -78,6 +78,10 @@ class _BoundError(ValueError):
     """A whole file exceeds a bound, so that to read on would be what the bound forbids."""
 
 
+class NoMcapError(ValueError):
+    """The file does not begin as MCAP does: there is nothing to recover."""
+
+
 class Damage(NamedTuple):
     """A place of a file that cannot be read: where it begins, its bytes, and what is wrong."""
 
@@ -108,12 +112,13 @@ def parts_of(file: IO[bytes], on_damage: OnDamage | None = None) -> Iterator[Par
     With ``on_damage`` what cannot be read is told to it, and the chunks behind it are read, too.
 
     Raises:
-        ValueError: It is no MCAP file, exceeds a bound or, without ``on_damage``, is damaged.
+        NoMcapError: It is no MCAP file.
+        ValueError: It exceeds a bound or, without ``on_damage``, is damaged.
         EOFError: The end is missing.
     """
     budget = _Budget(os.fstat(file.fileno()).st_size)
     if file.read(len(_MAGIC)) != _MAGIC:
-        raise ValueError("it is no MCAP file")
+        raise NoMcapError("it is no MCAP file")
     for opcode, data, at in _records(file, on_damage):
         if opcode == Opcode.FOOTER:
             if file.read(len(_MAGIC)) != _MAGIC:

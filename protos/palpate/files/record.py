@@ -21,6 +21,7 @@ from palpate.files.mcap_stream import (
     DAMAGED,
     Damage,
     McapMessage,
+    NoMcapError,
     OnDamage,
     Part,
     check_summary,
@@ -109,6 +110,10 @@ def read_record(
         ) from error
     except WireError as error:
         raise RecordingError(f"{path}: {error.problem}", remedy=error.remedy) from error
+    except NoMcapError as error:
+        raise RecordingError(
+            f"{path} is no MCAP file", remedy="give a record written by palpate"
+        ) from error
     except DAMAGED as error:
         if isinstance(error, RecordingError):
             raise

@@ -106,7 +106,7 @@ class InputReport:
         self._in_trouble = False
 
     def answered(self, sensor: str) -> None:
-        """An estimate of this sensor was published."""
+        """A message of this sensor got an estimate, or would have got one of a standby."""
         found = self._refused.pop(sensor, None)
         if found is not None and found.told:
             _log.info("sensor %s is answered again", sensor, extra=about(sensor))

@@ -255,6 +255,7 @@ class EstimatePublisher(Generic[M, E]):
                     self._refuse(received, sample.value, runtime)
                 elif runtime is not None and self._stands_by(sensor, runtime):
                     self._counts["standby"] += 1
+                    self._input.answered(sensor)  # it would have been
                 elif runtime is not None:
                     taken = _Taken(received, sample, taken_ns, time.monotonic_ns())
                     samples.setdefault(runtime, []).append(taken)
@@ -475,7 +476,7 @@ def serve(
         # A lossless replay is one run with one service, which must miss no frame.
         duty = None
         if config.delivery != "every":
-            duty = Duty(session, route.target.name, health, lease_s=link.lease_s)
+            duty = Duty(session, route.target.name, health, models, lease_s=link.lease_s)
         publisher = EstimatePublisher(
             route, session, config, health, models, estimation, rate_hz=rate_hz, duty=duty
         )

@@ -109,6 +109,9 @@ class ServedModels:
         repository: Where bundles are.
         file: Remembers what is served beyond the end of this process; None = nothing does.
 
+    Attributes:
+        standby: For which sensors the service stands by, in words; empty = for none.
+
     Raises:
         ConfigError: A bundle that the profile names does not exist, or is for another task.
         BundleError: It breaks its contract.
@@ -122,6 +125,7 @@ class ServedModels:
         repository: Repository,
         file: RememberedFile | None = None,
     ) -> None:
+        self.standby = ""
         self._task = task
         self._repository = repository
         self._file = file
@@ -282,6 +286,8 @@ class ServedModels:
 
     def describe(self) -> str:
         """One line for people."""
+        if self.standby:
+            return self.standby
         names = [
             f"{sensor} {_name(one.current)}" if sensor else _name(one.current)
             for sensor, one in sorted(self._serving.assigned.items())

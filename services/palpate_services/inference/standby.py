@@ -12,8 +12,8 @@ from palpate.bus import SensorClaims, Session
 from palpate.bus.topics import SensorClaim, duty_root
 from palpate.errors import ReplicaDiffers
 from palpate.health import Health
-from palpate.messages import ServiceState
 from palpate_services.inference.model import Runtime
+from palpate_services.inference.served import ServedModels, show
 
 
 class Duty:
@@ -23,18 +23,27 @@ class Duty:
         session: The bus.
         topic: Name of the topic of its estimates.
         health: Says for which sensors it stands by, and where the active one has another bundle.
+        models: The bundles of this service; told for which sensors it stands by.
         lease_s: After such a silence others see this process as gone [s].
     """
 
-    def __init__(self, session: Session, topic: str, health: Health, *, lease_s: float) -> None:
-        self._health = health
+    def __init__(
+        self,
+        session: Session,
+        topic: str,
+        health: Health,
+        models: ServedModels,
+        *,
+        lease_s: float,
+    ) -> None:
+        self._health, self._models = health, models
         self._claims: SensorClaims = session.claims(
             instance=health.instance,
             lease_s=lease_s,
             root=duty_root(topic),
         )
         self._bundles: dict[str, Runtime] = {}
-        self._message, self._differed = "", False
+        self._differed = False
 
     def take(self, sensor: str, runtime: Runtime) -> None:
         """Claim a sensor, whose bundle is ``runtime``, if it is not claimed yet."""
@@ -75,11 +84,13 @@ class Duty:
             sensor, rival = rivals[0]
             more = f" and {len(rivals) - 1} more" if len(rivals) > 1 else ""
             message = f"standby for {sensor}{more}: {rival.instance} on {rival.host} publishes"
+        different = message != self._models.standby
+        self._models.standby = message
         if differing:
             self._health.fail(differing[0])
-        elif message != self._message or self._differed:
-            self._health.set_state(ServiceState.READY, message)
-        self._message, self._differed = message, bool(differing)
+        elif different or self._differed:
+            show(self._models, self._health)
+        self._differed = bool(differing)
 
     def close(self) -> None:
         """Withdraw all claims, so that a standby takes over at once."""

@@ -7,6 +7,7 @@ module that uses Rerun, whose names change with each release.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import tempfile
 from collections import Counter
@@ -20,6 +21,7 @@ import numpy.typing as npt
 
 from palpate.bus.topics import TOPICS
 from palpate.errors import RecordingError
+from palpate.files.atomic import written_whole
 from palpate.files.bundle import FieldMesh
 from palpate.files.record import read_record
 from palpate.messages import FloatArray
@@ -111,10 +113,11 @@ class RerunView:
 
     Without a ``path`` there is no file, but ``take`` returns what has been drawn; views with one
     ``recording_id`` are then one recording to the viewer, whose layout shows ``known``, too.
-    ``title`` is shown as the recording's name; ``meshes`` None = those of the packaged bundles.
-    A ``live`` view may go on for days and takes less. Of the PAC samples, 2,200 a second and
-    sensor, it draws the smallest and the largest of each frame. It has no footer, whose parts Rerun
-    would keep in memory until the end, 5 MB a minute; viewers read the whole file instead.
+    ``title`` is shown as the recording's name, and errors call the file ``named``; ``meshes``
+    None = those of the packaged bundles. A ``live`` view may go on for days and takes less. Of the
+    PAC samples, 2,200 a second and sensor, it draws the smallest and the largest of each frame. It
+    has no footer, whose parts Rerun would keep in memory until the end, 5 MB a minute; viewers read
+    the whole file instead.
     """
 
     def __init__(
@@ -127,10 +130,12 @@ class RerunView:
         live: bool = False,
         recording_id: str | None = None,
         known: Mapping[str, SensorContents] | None = None,
+        named: Path | None = None,
     ) -> None:
         self._rr = require("rerun", extra="services")
         self._live = live
         self.path = path
+        self._named = named or path
         self.full = False
         self._max_bytes = max_bytes
         self._scenes: dict[str, SensorTimeline] = {}
@@ -152,7 +157,8 @@ class RerunView:
         if kind is None:
             self.close()
         else:
-            self._disconnect()
+            with contextlib.suppress(RecordingError):  # not instead of the error that there is
+                self._disconnect()
 
     @property
     def counters(self) -> Counter[str]:
@@ -182,10 +188,7 @@ class RerunView:
             for sensor in fresh:
                 self._draw(sensor, self._scenes[sensor])
         except Exception as error:  # Rerun's errors share no base of their own
-            raise RecordingError(
-                f"{self.path}: Rerun cannot write the view: {error}",
-                remedy="the MCAP record is not affected; make a view of it with: palpate review",
-            ) from error
+            raise self._unwritable(error) from error
         if self._max_bytes is not None and self.size() > self._max_bytes:
             _log.warning("%s has reached %d bytes and is closed", self.path, self._max_bytes)
             self.close()
@@ -210,17 +213,33 @@ class RerunView:
             return 0
 
     def close(self) -> None:
-        """Draw the rest and close the file."""
+        """Draw the rest and close the file.
+
+        Raises:
+            RecordingError: Rerun cannot write it.
+        """
         if self.full:
             return
         self.flush()
         self._disconnect()
 
     def _disconnect(self) -> None:
-        if self._open:
+        if not self._open:
+            return
+        self._open = False
+        try:
             self._stream.flush(timeout_sec=5.0)
+        except Exception as error:  # of a full disk, too
+            raise self._unwritable(error) from error
+        finally:
             self._stream.disconnect()
-            self._open = False
+
+    def _unwritable(self, error: Exception) -> RecordingError:
+        return RecordingError(
+            f"{self._named}: Rerun cannot write the view: {error}",
+            remedy="check the folder's rights and free space; the MCAP record is not affected, and "
+            "palpate review makes a view of it",
+        )
 
     def _prepare(self, sensors: list[str]) -> None:
         drawn = dict(self._drawn)
@@ -355,21 +374,33 @@ def _of_one_width(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
 def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = ()) -> Path:
     """Make the view of an existing record, by default beside it with the ending ``.rrd``.
 
-    ``bundles`` hold meshes of its fields, beside the packaged ones. Returns the view's path.
+    It is written whole or not at all; one that is there is replaced. ``bundles`` hold meshes of its
+    fields, beside the packaged ones. Returns the view's path.
 
     Raises:
         ConfigError: One of ``bundles`` does not exist.
-        RecordingError: The record is truncated or not palpate's.
+        RecordingError: The record is truncated or not palpate's, or has nothing that is drawn.
+        DatasetError: The disk refused.
         MissingExtraError: Rerun is not installed.
     """
     target = record.with_suffix(".rrd") if view is None else view
-    with RerunView(target, title=record.stem, meshes=MeshLibrary(bundles)) as drawn:
+    meshes = MeshLibrary(bundles)
+    with (
+        written_whole(target) as part,
+        RerunView(part, title=record.stem, meshes=meshes, named=target) as drawn,
+    ):
         for count, item in enumerate(read_record(record), start=1):
             topic = item.address.topic
             if topic in SensorTimeline.TOPICS:
                 drawn.add(item.address.sensor, TOPICS[topic].codec.decode(item.payload))
             if count % (BATCH_MESSAGES * len(SensorTimeline.TOPICS)) == 0:
                 drawn.flush()
+        drawn.close()
+        if not part.exists():
+            raise RecordingError(
+                f"{record} holds nothing that a view shows",
+                remedy="give a record with frames or estimates: palpate info",
+            )
     for name, count in drawn.counters.items():
         if count:
             _log.warning("%s: %s %d", target, name, count)

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
+from palpate.files.atomic import written_whole
 from palpate.files.hdf5 import text
 from palpate.files.simulation_store import SimulationFiles, choose_trajectories
 from palpate.process import require
@@ -55,7 +56,8 @@ def review_simulations(
 ) -> Path:
     """Make the view of a store, by default beside it with the ending ``.rrd``; returns its path.
 
-    ``trajectories`` chooses some by id or pattern; without, ``most`` are evenly chosen from all.
+    It is written whole or not at all; one that is there is replaced. ``trajectories`` chooses some
+    by id or pattern; without, ``most`` are evenly chosen from all.
     ``progress`` is called with the number of drawn trajectories and of all.
 
     Raises:
@@ -70,23 +72,24 @@ def review_simulations(
     longest_m = max(_largest(simulations.trajectory(name).displacement) for name in names) or 1e-3
     target = store.with_suffix(".rrd") if view is None else view
     stream = rr.RecordingStream(APPLICATION)
-    try:
-        stream.save(target, default_blueprint=simulation_layout(names, longest_m))
-        stream.send_recording_name(store.stem)
-        for count, name in enumerate(names):
-            if progress is not None:
-                progress(count, len(names))
-            _Drawing(rr, stream, finger, simulations.trajectory(name), longest_m).draw()
-        stream.flush(timeout_sec=30.0)
-    except DatasetError:
-        raise
-    except Exception as error:  # Rerun's errors share no base of their own
-        raise DatasetError(
-            f"{target}: Rerun cannot write the view: {error}",
-            remedy="check the folder's rights and free space; the store is not affected",
-        ) from error
-    finally:
-        stream.disconnect()
+    with written_whole(target) as part:
+        try:
+            stream.save(part, default_blueprint=simulation_layout(names, longest_m))
+            stream.send_recording_name(store.stem)
+            for count, name in enumerate(names):
+                if progress is not None:
+                    progress(count, len(names))
+                _Drawing(rr, stream, finger, simulations.trajectory(name), longest_m).draw()
+            stream.flush(timeout_sec=30.0)
+        except DatasetError:
+            raise
+        except Exception as error:  # Rerun's errors share no base of their own
+            raise DatasetError(
+                f"{target}: Rerun cannot write the view: {error}",
+                remedy="check the folder's rights and free space; the store is not affected",
+            ) from error
+        finally:
+            stream.disconnect()
     return target
 
 

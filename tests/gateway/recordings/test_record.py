@@ -70,7 +70,7 @@ def test_cut_record_delivers_and_then_says_so(record: Callable[..., Path]) -> No
 def test_not_a_record(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"hello")
-    with pytest.raises(RecordingError, match=r"a\.mcap is damaged or cut off"):
+    with pytest.raises(RecordingError, match=r"a\.mcap is no MCAP file"):
         messages(path)
     with pytest.raises(RecordingError, match="does not exist"):
         messages(tmp_path / "no.mcap")

@@ -116,7 +116,19 @@ def _has_rerun() -> bool:
 @contextlib.contextmanager
 def _serving(application: WebApplication, config: WebConfig) -> Iterator[None]:
     """Serve in a thread while the block runs."""
-    from waitress.server import create_server
+    from waitress.channel import HTTPChannel
+    from waitress.server import TcpWSGIServer, create_server
+
+    class OneAnswer(HTTPChannel):  # type: ignore[misc]
+        """A connection that is closed after one answer.
+
+        A thread would wait for the reader of earlier answers before it made another one, as long as
+        that reader liked: four of them held up everybody.
+        """
+
+        def service(self) -> None:
+            self.requests[0].headers["CONNECTION"] = "close"
+            super().service()
 
     # Its remarks on queues of requests are about threads of ours, not about the station.
     logging.getLogger("waitress.queue").setLevel(logging.ERROR)
@@ -130,8 +142,6 @@ def _serving(application: WebApplication, config: WebConfig) -> Iterator[None]:
             port=port,
             threads=_THREADS,
             connection_limit=CONNECTIONS_MOST,
-            channel_timeout=IDLE_S,
-            cleanup_interval=5,
             max_request_header_size=_HEADER_BYTES_MOST,
             max_request_body_size=_HEADER_BYTES_MOST,
             clear_untrusted_proxy_headers=True,
@@ -143,13 +153,23 @@ def _serving(application: WebApplication, config: WebConfig) -> Iterator[None]:
             f"{getattr(error, 'strerror', None) or error}",
             remedy="choose an address of this host and a free port: [web] listen in the profile",
         ) from error
+    # A name, e.g. localhost, may have several addresses.
+    servers = [one for one in channels.values() if isinstance(one, TcpWSGIServer)]
+    for one in servers:
+        one.channel_class = OneAnswer
     ended = threading.Event()
 
     def serve() -> None:
         while not ended.is_set():
             server.asyncore.loop(timeout=_POLL_S, map=channels, use_poll=True, count=1)
+            # waitress would wait until the socket takes more, which one that is not read never does
+            for idle in [
+                one
+                for one in channels.values()
+                if isinstance(one, HTTPChannel) and time.time() - one.last_activity > IDLE_S
+            ]:
+                idle.handle_close()
         server.task_dispatcher.shutdown()
-        server.asyncore.close_all(channels)
 
     thread = threading.Thread(target=serve, name="web", daemon=True)
     thread.start()
@@ -157,5 +177,6 @@ def _serving(application: WebApplication, config: WebConfig) -> Iterator[None]:
         yield
     finally:
         ended.set()
-        server.pull_trigger()
+        servers[0].pull_trigger()  # any wakes the loop, which is that of all
         thread.join(timeout=5.0)
+        server.asyncore.close_all(channels)
