@@ -179,9 +179,7 @@ def add_intervals(
         out,
         model=bundle.model,
         golden=bundle.golden,
-        manifest=replace(
-            manifest, intervals=intervals, version=version_of(out, manifest.version)
-        ),
+        manifest=replace(manifest, intervals=intervals, version=version_of(out, manifest.version)),
         mesh=bundle.mesh,
         known_inputs=known,
     )
