@@ -132,7 +132,7 @@ def test_a_broken_file_is_named(path: Path, change: Callable[[Any], None], words
 
 def test_nothing_is_learned_from_forces_in_mn(data: FeatureDataset) -> None:
     check_learnable(data)
-    with pytest.raises(DatasetError, match="N in row .* more than a fingertip bears .* mN"):
+    with pytest.raises(DatasetError, match=r"N in row .* more than a fingertip bears .* mN"):
         check_learnable(replace(data, force=1e3 * data.force))
 
 
