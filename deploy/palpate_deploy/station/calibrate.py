@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+import tempfile
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -170,6 +171,9 @@ def calibrate_finger(
         LinkError: There is no router, or no such finger, or no force sensor for it.
         DatasetError: Too few presses.
         BundleError: The bundle cannot be written.
+        ConfigError: The order contradicts itself or the files that it names, or its folder cannot
+            be written.
+        KeyboardInterrupt: It was interrupted before there were presses enough.
         MissingExtraError: The training extra is not installed.
     """
     for module in EXTRA_MODULES:
@@ -182,6 +186,8 @@ def calibrate_finger(
         _check_not_shipped(order.name)
     others = _Others.read(order.others)
     secret = b""
+    if order.presses and order.source is None:
+        _check_writable(order.out)
     if order.serve:
         secret = read_token(token_file(kept.memory_folder, station) if token is None else token)
     source = order.source
@@ -197,6 +203,7 @@ def calibrate_finger(
         if source is None:
             source, live = record_presses(
                 *(link, station, order.sensor, order.presses, order.out, console),
+                least=PRESSES_LEAST,
                 check=others.check,
             )
         data, serials = _rows(source, order.sensor)
@@ -272,6 +279,23 @@ def _digests(data: FeatureDataset) -> list[str]:
     from palpate_training.evaluation.transfer import fingers_of
 
     return [finger.digest for finger in fingers_of(data)]
+
+
+def _check_writable(folder: Path) -> None:
+    """Make the folder of a record, and write to it.
+
+    Raises:
+        ConfigError: That is not possible.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ConfigError(
+            f"presses cannot be recorded to {folder}: {error.strerror}",
+            remedy="give a folder that this user may write to: palpate calibrate --out FOLDER",
+        ) from error
 
 
 def _check_not_shipped(name: str) -> None:
