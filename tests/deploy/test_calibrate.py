@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,12 +25,13 @@ import palpate_training
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, LinkError, StreamTimeout
-from palpate.files.bundle import read_bundle
+from palpate.errors import BundleError, ConfigError, LinkError, StreamTimeout
+from palpate.files.bundle import read_bundle, write_bundle
 from palpate.messages import NO_TARE, QualityFlag
 from palpate_deploy.station import calibrate, guided_presses
 from palpate_deploy.station.guided_presses import HELD_S, PressCounter
 from palpate_services.config import RecorderConfig
+from palpate_services.inference.repository import resolve
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import of_sensor, write_dataset
@@ -233,6 +235,37 @@ def test_a_record_of_another_finger_is_not_learned_from(
         calibrate.calibrate_finger(
             LinkConfig(), "lab", order, token=None, profile=None, as_json=True
         )
+
+
+def test_a_version_that_another_takes_meanwhile_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One is written while this one learns, and another between its choice and its writing."""
+    shipped = resolve("features-virtual")
+    first = 1 + int(shipped.name)
+    taken = [tmp_path / shipped.parent.name / str(first + more) for more in range(3)]
+
+    def learn(folder: Path) -> finger.FingerReport:
+        shutil.copytree(shipped, folder)
+        shutil.copytree(shipped, taken[0])
+        return finger.FingerReport(b"", "a line", {}, 7, 700)
+
+    def write(folder: Path, **parts: Any) -> bytes:
+        if not taken[1].exists():
+            shutil.copytree(shipped, taken[1])
+        return write_bundle(folder, **parts)
+
+    monkeypatch.setattr(calibrate, "write_bundle", write)
+    new, report = calibrate._written(learn, tmp_path)
+    assert new.folder == taken[2]
+    written = read_bundle(new.folder)
+    assert written.manifest.version == new.version == first + 2
+    assert written.sha256 == report.digest
+    assert written.golden.keys() == read_bundle(shipped).golden.keys()
+    (tmp_path / "file").touch()
+    taken[0] = tmp_path / "elsewhere"
+    with pytest.raises(BundleError, match="cannot write"):
+        calibrate._written(learn, tmp_path / "file")
 
 
 def test_a_data_set_is_of_the_finger_that_is_named(palpate: Palpate, tmp_path: Path) -> None:

@@ -295,7 +295,8 @@ def _guide(
     with (
         session.subscriber(ELECTRODES, sensor=sensor) as frames,
         session.subscriber(WRENCH, sensor=sensor, delivery=Delivery.QUEUE) as forces,
-        Live(bar, console=console, refresh_per_second=10),
+        # In a file the bar would be the beginning of whatever is written next.
+        Live(bar, console=console, refresh_per_second=10, transient=not console.is_terminal),
     ):
         while counter.count < presses and not interrupted.is_set():
             batch = forces.next_batch(_SEEN_S)
