@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import itertools
 import json
+import os
 import shutil
 import signal
 import subprocess
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +25,13 @@ import palpate_training
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, LinkError
-from palpate.files.bundle import read_bundle
-from palpate.messages import QualityFlag
+from palpate.errors import BundleError, ConfigError, LinkError, StreamTimeout
+from palpate.files.bundle import read_bundle, write_bundle
+from palpate.messages import NO_TARE, QualityFlag
 from palpate_deploy.station import calibrate, guided_presses
 from palpate_deploy.station.guided_presses import HELD_S, PressCounter
 from palpate_services.config import RecorderConfig
+from palpate_services.inference.repository import resolve
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import of_sensor, write_dataset
@@ -46,6 +54,7 @@ SAMPLE = Path(palpate_training.__file__).parent / "samples" / "twin.h5"
         (["--presses", "0", "--others", "FILE", "--others", "FILE"], "a file is named twice"),
         (["--others", "missing.h5"], "missing.h5"),
         (["--presses", "0", "--others", "FILE"], "FILE"),
+        (["--out", "FILE"], "FILE: File exists"),
     ],
 )
 def test_what_contradicts_itself_is_refused(
@@ -63,7 +72,7 @@ def test_what_contradicts_itself_is_refused(
 def count(*readings: tuple[float, float]) -> tuple[int, float]:
     counter = PressCounter()
     for now_s, force_n in readings:
-        counter.take(now_s, force_n)
+        counter.take(now_s, force_n, seen=True)
     return counter.count, counter.largest_n
 
 
@@ -74,13 +83,13 @@ def test_the_command_wants_as_many_presses_as_the_training() -> None:
 class TestPresses:
     def test_a_press_is_counted_when_it_ends(self) -> None:
         counter = PressCounter()
-        assert not counter.take(0.0, 0.1)
-        assert not counter.take(0.1, 2.0)
+        assert not counter.take(0.0, 0.1, seen=True)
+        assert not counter.take(0.1, 2.0, seen=True)
         assert counter.pressed
-        assert not counter.take(0.1 + HELD_S, 3.0)
-        assert not counter.take(0.2 + HELD_S, 0.3)
+        assert not counter.take(0.1 + HELD_S, 3.0, seen=False)
+        assert not counter.take(0.2 + HELD_S, 0.3, seen=True)
         assert counter.count == 0
-        assert counter.take(0.3 + HELD_S, 0.1)
+        assert counter.take(0.3 + HELD_S, 0.1, seen=True)
         assert (counter.count, counter.largest_n, counter.pressed) == (1, 3.0, False)
 
     def test_a_knock_does_not_count(self) -> None:
@@ -89,6 +98,97 @@ class TestPresses:
     def test_a_force_about_the_threshold_is_one_press(self) -> None:
         wavering = [(0.1 * k, 0.45 + 0.1 * (k % 2)) for k in range(20)]
         assert count(*wavering, (2.0, 0.0))[0] == 1
+
+    def test_a_press_without_electrodes_does_not_count(self) -> None:
+        """Those that come as it is let go tell nothing of it."""
+        counter = PressCounter()
+        counter.take(0.0, 2.0, seen=False)
+        counter.take(2.0, 0.4, seen=True)
+        assert not counter.take(2.1, 0.0, seen=True)
+        assert counter.count == 0
+        assert not counter.pressed
+
+
+class Streams:
+    """A session whose force presses for a second out of two, ``presses`` times."""
+
+    def __init__(self, presses: int, frames: Callable[[], SimpleNamespace | None]) -> None:
+        self._presses, self._frames = presses, frames
+
+    @contextlib.contextmanager
+    def subscriber(self, topic: object, **_: object) -> Iterator[SimpleNamespace]:
+        forces = iter(np.tile(np.repeat([2.0, 0.0], 10), self._presses))
+        times_s = itertools.count(step=0.1)
+
+        def wrench() -> SimpleNamespace:
+            stamp = SimpleNamespace(monotonic_ns=1e9 * next(times_s))
+            return SimpleNamespace(force=np.array([0.0, 0.0, next(forces)]), stamp=stamp)
+
+        make = wrench if topic is WRENCH else self._frames
+
+        def next_batch(_: float) -> list[SimpleNamespace]:
+            message = make()
+            return [] if message is None else [SimpleNamespace(message=message)]
+
+        yield SimpleNamespace(next_batch=next_batch)
+
+
+def guide(streams: Streams, presses: int) -> int:
+    return guided_presses._guide(
+        streams,  # type: ignore[arg-type]
+        "finger",
+        presses,
+        Path("rec"),
+        threading.Event(),
+        Console(quiet=True),
+        check=lambda: None,
+    )
+
+
+def test_presses_are_counted_while_electrodes_come() -> None:
+    frame = SimpleNamespace(electrodes_valid=True, tare_id=1)
+    assert guide(Streams(7, lambda: frame), 7) == 7
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        None,
+        SimpleNamespace(electrodes_valid=False, tare_id=1),
+        SimpleNamespace(electrodes_valid=True, tare_id=NO_TARE),
+    ],
+)
+def test_electrodes_that_stop_end_the_presses(
+    frame: SimpleNamespace | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The force alone teaches nothing, and the person is not to blame."""
+    monkeypatch.setattr(guided_presses, "_SEEN_S", 0.0)
+    with pytest.raises(StreamTimeout, match=r"no valid, tared electrodes of 'finger' .* rec keeps"):
+        guide(Streams(7, lambda: frame), 7)
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_too_few_presses_until_ctrl_c_are_not_learned_from(
+    recorded: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(config: RecorderConfig, *_: object, **__: object) -> None:
+        if recorded:
+            config.out.mkdir(parents=True)
+            (config.out / "lab-1.mcap").write_text("own")
+
+    def tare(_: object, __: str, interrupted: threading.Event, **___: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert interrupted.wait(60)
+
+    monkeypatch.setattr(Session, "open", lambda *_, **__: contextlib.nullcontext())
+    monkeypatch.setattr(guided_presses, "_first", lambda *_: SimpleNamespace(sensor_serial="BT-1"))
+    monkeypatch.setattr(guided_presses, "run_recorder", run)
+    monkeypatch.setattr(guided_presses, "tare_at_rest", tare)
+    said = Console(file=io.StringIO(), record=True)
+    with pytest.raises(KeyboardInterrupt):
+        guided_presses.record_presses(LinkConfig(), "lab", "finger", 7, tmp_path, said, least=6)
+    kept = f"the record is {tmp_path / 'lab-1.mcap'}" if recorded else "nothing is kept"
+    assert f"stopped after 0 presses; {kept}" in said.export_text()
 
 
 def test_the_record_is_that_of_its_own_recorder(
@@ -119,7 +219,9 @@ def test_a_signal_after_the_presses_ends_the_learning(
 
     monkeypatch.setattr(Session, "open", refuse)
     with pytest.raises(LinkError):
-        guided_presses.record_presses(LinkConfig(), "lab", "finger", 7, tmp_path, Console())
+        guided_presses.record_presses(
+            LinkConfig(), "lab", "finger", 7, tmp_path, Console(), least=6
+        )
     assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)] == before
 
 
@@ -133,6 +235,37 @@ def test_a_record_of_another_finger_is_not_learned_from(
         calibrate.calibrate_finger(
             LinkConfig(), "lab", order, token=None, profile=None, as_json=True
         )
+
+
+def test_a_version_that_another_takes_meanwhile_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One is written while this one learns, and another between its choice and its writing."""
+    shipped = resolve("features-virtual")
+    first = 1 + int(shipped.name)
+    taken = [tmp_path / shipped.parent.name / str(first + more) for more in range(3)]
+
+    def learn(folder: Path) -> finger.FingerReport:
+        shutil.copytree(shipped, folder)
+        shutil.copytree(shipped, taken[0])
+        return finger.FingerReport(b"", "a line", {}, 7, 700)
+
+    def write(folder: Path, **parts: Any) -> bytes:
+        if not taken[1].exists():
+            shutil.copytree(shipped, taken[1])
+        return write_bundle(folder, **parts)
+
+    monkeypatch.setattr(calibrate, "write_bundle", write)
+    new, report = calibrate._written(learn, tmp_path)
+    assert new.folder == taken[2]
+    written = read_bundle(new.folder)
+    assert written.manifest.version == new.version == first + 2
+    assert written.sha256 == report.digest
+    assert written.golden.keys() == read_bundle(shipped).golden.keys()
+    (tmp_path / "file").touch()
+    taken[0] = tmp_path / "elsewhere"
+    with pytest.raises(BundleError, match="cannot write"):
+        calibrate._written(learn, tmp_path / "file")
 
 
 def test_a_data_set_is_of_the_finger_that_is_named(palpate: Palpate, tmp_path: Path) -> None:
@@ -179,11 +312,6 @@ def test_from_presses_to_estimates(
     assert other.returncode != 0
     assert "nothing comes on electrodes of 'thumb'" in other.stderr
     assert "palpate status" in other.stderr
-    (tmp_path / "file").write_text("not a folder")
-    blocked = palpate("calibrate", "--profile", profile, "--out", tmp_path / "file", timeout=240)
-    assert blocked.returncode != 0
-    assert "recorder.out" in blocked.stderr
-    assert "press 9 of" not in blocked.stdout, "nobody presses for nothing"
     done = palpate(
         *("calibrate", "finger", "--presses", "16", "--profile", profile),
         *("--out", tmp_path / "rec", "--json"),

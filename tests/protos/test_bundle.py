@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -105,9 +107,22 @@ def test_a_manifest_that_breaks_the_contract_is_refused(
 
 
 def test_nothing_is_left_of_a_bundle_that_is_refused(
-    tmp_path: Path, manifest: Manifest, golden: dict[str, npt.NDArray[np.float32]]
+    tmp_path: Path,
+    manifest: Manifest,
+    golden: dict[str, npt.NDArray[np.float32]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     target = tmp_path / "models" / "1"
+
+    def full(*_: object, **__: object) -> str:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    for refuses in ("tempfile.mkdtemp", "os.rename"):
+        with monkeypatch.context() as disk:
+            disk.setattr(refuses, full)
+            with pytest.raises(BundleError, match="No space left"):
+                write_bundle(target, model=b"", golden=golden, manifest=manifest)
+        assert not list(tmp_path.iterdir())
     with pytest.raises(BundleError, match="lack force_sd"):
         write_bundle(
             target,

@@ -103,6 +103,19 @@ def test_a_version_never_changes(repository: Repository, make_bundle: Callable[.
         repository.add(make_bundle(name="mine", trained_on="other data"), read_bundle)
 
 
+def test_a_copy_under_another_name_is_not_read(
+    repository: Repository, make_bundle: Callable[..., Path]
+) -> None:
+    """Its estimates would carry the name of another bundle than the one that was asked for."""
+    made = make_bundle(name="mine", version=12)
+    assert repository.folder is not None
+    for name, version in (("mine", "13"), ("yours", "12")):
+        shutil.copytree(made, repository.folder / name / version)
+        with pytest.raises(BundleError, match="holds mine:12, so it lies in the wrong place"):
+            repository.read(repository.resolve(f"{name}:{version}"))
+    assert repository.read(made).manifest.version == 12, "elsewhere a folder has any name"
+
+
 def test_a_packaged_version_is_not_hidden_by_an_imported_one(
     tmp_path: Path, make_bundle: Callable[..., Path]
 ) -> None:

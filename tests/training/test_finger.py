@@ -164,7 +164,7 @@ def test_what_never_changes_is_refused(press_data: MakeData, tmp_path: Path) -> 
         train_finger(dead, tmp_path / "b", name="features-mine")
     absurd = data.force.copy()
     absurd[7, 1] = 1e30
-    with pytest.raises(DatasetError, match=r"force y is 1e\+30 N in row 7"):
+    with pytest.raises(DatasetError, match=r"force is 1e\+30 N in row 7"):
         train_finger(replace(data, force=absurd), tmp_path / "b", name="features-mine")
     assert not list(tmp_path.iterdir())
 

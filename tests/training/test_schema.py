@@ -12,7 +12,13 @@ import numpy as np
 import pytest
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.features import FeatureDataset, open_dataset, press_of, write_dataset
+from palpate_training.datasets.features import (
+    FeatureDataset,
+    check_learnable,
+    open_dataset,
+    press_of,
+    write_dataset,
+)
 
 MakeData = Callable[..., FeatureDataset]
 
@@ -102,6 +108,9 @@ def _replace(name: str, values: Any, unit: str) -> Callable[[Any], None]:
         (lambda f: f.__delitem__("group"), "'group' is missing"),
         (lambda f: f["force"].attrs.__setitem__("unit", "mN"), "force is in 'mN'.*'N'"),
         (lambda f: f["force"].__setitem__((11, 1), np.nan), "force is not finite in row 11"),
+        (lambda f: f["baseline"].__setitem__((4, 2), 1e9), r"rest of E3 is 1e\+09 in row 4"),
+        (lambda f: f["baseline"].__setitem__((4, 2), -5.0), "rest of E3 is -5 in row 4"),
+        (lambda f: f["baseline"].__setitem__(4, 0.0), "rest of E1 is 0 in row 4"),
         (lambda f: f["force"].__setitem__((3, 0), 9.0), "content_sha256"),
         (lambda f: f["electrodes"].__setitem__((5, 0), 5000), "4095 counts in row 5"),
         (
@@ -119,6 +128,12 @@ def test_a_broken_file_is_named(path: Path, change: Callable[[Any], None], words
         open_dataset(path)
     assert str(path) in str(caught.value)
     assert caught.value.remedy
+
+
+def test_nothing_is_learned_from_forces_in_mn(data: FeatureDataset) -> None:
+    check_learnable(data)
+    with pytest.raises(DatasetError, match=r"N in row .* more than a fingertip bears .* mN"):
+        check_learnable(replace(data, force=1e3 * data.force))
 
 
 def test_location_must_be_known_in_contact_only(path: Path, data: FeatureDataset) -> None:

@@ -243,6 +243,7 @@ def test_whole_times_are_not_rounded(data: FeatureDataset, unit: str, ns: int) -
         (lambda rows: put(rows, "rest_3", -5.0), r"rest of E3 is -5 in row 4"),
         (lambda rows: put(rows, "rest_3", 1e9), r"rest of E3 is 1e\+09 in row 4"),
         (no_rest, r"rest of E1 is 0 in row 0"),
+        (lambda rows: put(rows, "force_z_n", -5000.0), "force is 5000 N in row 4.*force_unit"),
         (lambda rows: put(rows, "force_z_n", float("inf")), "force is not known in row 4"),
         (lambda rows: put(rows, "in_contact", 3.0), "'in_contact' holds 3 in row 4"),
         (lambda rows: put(rows, "in_contact", None), "in_contact is not known in row 4"),

@@ -8,10 +8,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from palpate.errors import DatasetError
 from palpate.files.bundle import read_bundle
 from palpate_training.cli import data_app, train_app
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks, write_dataset
@@ -61,6 +63,15 @@ def test_inspect_shows_units_and_provenance(press_data: MakeData, tmp_path: Path
     assert result.exit_code == 0, result.output
     for word in ("electrodes", "counts", "made by a test", "free", "3 groups"):
         assert word in result.output
+
+
+def test_inspect_names_every_schema_that_it_knows(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file.attrs["schema"] = "something.else"
+    refused = CliRunner().invoke(data_app, ["inspect", str(tmp_path / "x.h5")])
+    assert isinstance(refused.exception, DatasetError)
+    for name in ("features", "trials", "experiment", "mixed"):
+        assert f"'palpate.{name}'" in str(refused.exception)
 
 
 @pytest.mark.parametrize("app", [train_app, data_app])

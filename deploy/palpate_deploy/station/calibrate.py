@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
+import tempfile
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,8 @@ from palpate.admin import read_token, token_file
 from palpate.bus import Session
 from palpate.client.models import ModelAdmin
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError
+from palpate.errors import BundleError, ConfigError
+from palpate.files.bundle import read_bundle, write_bundle
 from palpate.process import check_installed
 from palpate_deploy.station.guided_presses import record_presses, untouched
 from palpate_deploy.station.profile import Profile
@@ -170,6 +172,9 @@ def calibrate_finger(
         LinkError: There is no router, or no such finger, or no force sensor for it.
         DatasetError: Too few presses.
         BundleError: The bundle cannot be written.
+        ConfigError: The order contradicts itself or the files that it names, or its folder cannot
+            be written.
+        KeyboardInterrupt: It was interrupted before there were presses enough.
         MissingExtraError: The training extra is not installed.
     """
     for module in EXTRA_MODULES:
@@ -182,6 +187,8 @@ def calibrate_finger(
         _check_not_shipped(order.name)
     others = _Others.read(order.others)
     secret = b""
+    if order.presses and order.source is None:
+        _check_writable(order.out)
     if order.serve:
         secret = read_token(token_file(kept.memory_folder, station) if token is None else token)
     source = order.source
@@ -189,14 +196,18 @@ def calibrate_finger(
         tare = untouched(link, station, order.sensor, console)
         others.check(tare.sensor_serial)
         serials = [tare.sensor_serial] if tare.sensor_serial else []
-        new = _NewBundle.of(order, serials, kept.repository_folder)
+        name = _name_of(order, serials)
         rest = tare.electrodes.astype(np.float64)
-        report = _learn_unpressed(rest, others.fingers, new, console)
+        new, report = _written(
+            lambda folder: _learn_unpressed(rest, others.fingers, folder, name, console),
+            kept.repository_folder,
+        )
     else:
         live = ""
         if source is None:
             source, live = record_presses(
                 *(link, station, order.sensor, order.presses, order.out, console),
+                least=PRESSES_LEAST,
                 check=others.check,
             )
         data, serials = _rows(source, order.sensor)
@@ -209,8 +220,11 @@ def calibrate_finger(
         for serial in serials:
             others.check(serial)
         others.check_rows(data)
-        new = _NewBundle.of(order, serials, kept.repository_folder)
-        report = _learn(data, serials, others.fingers, new, console)
+        name = _name_of(order, serials)
+        new, report = _written(
+            lambda folder: _learn(data, serials, others.fingers, folder, name, console),
+            kept.repository_folder,
+        )
     label = f"{new.name}:{new.version}"
     if as_json:
         print(
@@ -274,6 +288,23 @@ def _digests(data: FeatureDataset) -> list[str]:
     return [finger.digest for finger in fingers_of(data)]
 
 
+def _check_writable(folder: Path) -> None:
+    """Make the folder of a record, and write to it.
+
+    Raises:
+        ConfigError: That is not possible.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ConfigError(
+            f"presses cannot be recorded to {folder}: {error.strerror}",
+            remedy="give a folder that this user may write to: palpate calibrate --out FOLDER",
+        ) from error
+
+
 def _check_not_shipped(name: str) -> None:
     """Refuse the name of a bundle that ships: a station would take one finger's for newer.
 
@@ -296,20 +327,61 @@ class _NewBundle:
     folder: Path
 
     @classmethod
-    def of(cls, order: CalibrationOrder, serials: Sequence[str], repository: Path) -> _NewBundle:
-        """That of a finger with these serial numbers."""
-        name = order.name or f"features-{_plain(serials[0] if serials else order.sensor)}"
-        _check_not_shipped(name)
+    def of(cls, name: str, repository: Path) -> _NewBundle:
+        """As the repository is now."""
         known = [label.partition(":") for label in Repository(repository).available()]
         version = 1 + max((int(number) for other, _, number in known if other == name), default=0)
         return cls(name, version, repository / name / str(version))
+
+
+def _name_of(order: CalibrationOrder, serials: Sequence[str]) -> str:
+    """Of the bundle of a finger with these serial numbers.
+
+    Raises:
+        ConfigError: It is that of a bundle that ships.
+    """
+    name = order.name or f"features-{_plain(serials[0] if serials else order.sensor)}"
+    _check_not_shipped(name)
+    return name
+
+
+def _written(
+    learn: Callable[[Path], FingerReport], repository: Path
+) -> tuple[_NewBundle, FingerReport]:
+    """Learn a bundle into a folder, and write it into the repository as the next version.
+
+    Another of the same name may have been written meanwhile; so which one is the next is only
+    asked when all is learned.
+
+    Raises:
+        BundleError: The repository cannot be written.
+    """
+    with tempfile.TemporaryDirectory(prefix="palpate-calibrate-") as temporary:
+        report = learn(Path(temporary) / "bundle")
+        made = read_bundle(Path(temporary) / "bundle")
+    while True:
+        new = _NewBundle.of(made.manifest.name, repository)
+        try:
+            digest = write_bundle(
+                new.folder,
+                model=made.model,
+                golden=made.golden,
+                manifest=replace(made.manifest, version=new.version),
+                known_inputs=made.known_inputs,
+            )
+        except BundleError:
+            if new == _NewBundle.of(made.manifest.name, repository):
+                raise
+        else:
+            return new, replace(report, digest=digest)
 
 
 def _learn(
     data: FeatureDataset,
     serials: Sequence[str],
     others: Sequence[OtherFinger],
-    new: _NewBundle,
+    folder: Path,
+    name: str,
     console: Console,
 ) -> FingerReport:
     from palpate_training.tasks.finger import STEPS, train_finger
@@ -320,9 +392,8 @@ def _learn(
         task = progress.add_task("", total=STEPS)
         return train_finger(
             data,
-            new.folder,
-            name=new.name,
-            version=new.version,
+            folder,
+            name=name,
             serials=serials,
             others=others,
             on_step=lambda: progress.advance(task),
@@ -332,13 +403,14 @@ def _learn(
 def _learn_unpressed(
     rest: npt.NDArray[np.float64],
     others: Sequence[OtherFinger],
-    new: _NewBundle,
+    folder: Path,
+    name: str,
     console: Console,
 ) -> FingerReport:
     from palpate_training.tasks.other_fingers import train_unpressed
 
     with console.status("learn from other fingers, each left out in its turn"):
-        return train_unpressed(others, rest, new.folder, name=new.name, version=new.version)
+        return train_unpressed(others, rest, folder, name=name)
 
 
 def _show(report: FingerReport, label: str, console: Console) -> None:

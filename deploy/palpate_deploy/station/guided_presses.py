@@ -21,7 +21,7 @@ from palpate.bus import Delivery, Session
 from palpate.bus.topics import ELECTRODES, WRENCH, Topic
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import LinkError, RecordingError, StreamTimeout
-from palpate.messages import Tare
+from palpate.messages import NO_TARE, ElectrodeFrame, Tare
 from palpate.process import stop_on_signals
 from palpate_deploy.station.tare import tare_at_rest
 from palpate_services.config import EVERYTHING, RecorderConfig
@@ -60,30 +60,36 @@ _AGAIN_S = 0.5
 
 
 class PressCounter:
-    """Counts presses in a stream of forces: each begins, is held, and ends."""
+    """Counts presses in a stream of forces: each begins, is held, is seen, and ends."""
 
     def __init__(self) -> None:
         self.count = 0
         self.largest_n = 0.0
         self._since_s: float | None = None
+        self._seen = False
 
     @property
     def pressed(self) -> bool:
         """Whether one is under way."""
         return self._since_s is not None
 
-    def take(self, now_s: float, force_n: float) -> bool:
-        """One reading: its time [s] and the magnitude [N]; whether it ended a press that counts."""
+    def take(self, now_s: float, force_n: float, *, seen: bool) -> bool:
+        """One reading: its time [s] and the magnitude [N]; whether it ended a press that counts.
+
+        ``seen``: Whether electrodes came with it. Nothing is learned from a force without them.
+        """
         if self._since_s is None:
-            if force_n >= PRESS_N:
-                self._since_s, self.largest_n = now_s, force_n
-            return False
+            if force_n < PRESS_N:
+                return False
+            self._since_s, self.largest_n, self._seen = now_s, force_n, False
         self.largest_n = max(self.largest_n, force_n)
+        self._seen |= seen and force_n >= PRESS_N
         if force_n >= RELEASE_N:
             return False
-        held, self._since_s = now_s - self._since_s >= HELD_S, None
-        self.count += held
-        return held
+        counts = self._seen and now_s - self._since_s >= HELD_S
+        self._since_s = None
+        self.count += counts
+        return counts
 
 
 def untouched(link: LinkConfig, station: str, sensor: str, console: Console) -> Tare:
@@ -109,11 +115,12 @@ def record_presses(
     out: Path,
     console: Console,
     *,
+    least: int,
     check: Callable[[str], None] = lambda _: None,
 ) -> tuple[Path, str]:
     """Guide through so many presses while they are recorded; the record, and the serial number.
 
-    Ctrl-C ends before the last press; what was recorded then is learned from.
+    Ctrl-C ends before the last press; what was recorded then is learned from, if that is enough.
 
     Args:
         link: To the router.
@@ -122,6 +129,7 @@ def record_presses(
         presses: How many.
         out: Folder of the record.
         console: Where the guide is shown.
+        least: Fewer presses are not enough to learn from.
         check: Given the finger's serial number before it is pressed; may refuse it.
 
     Raises:
@@ -129,7 +137,9 @@ def record_presses(
         RemoteError: The gateway takes no tare.
         StreamTimeout: A stream ends, or the finger is not let go.
         RecordingError: The record cannot be written.
+        KeyboardInterrupt: It was interrupted before ``least`` presses.
     """
+    count = 0
     with _until_recorded() as interrupted, Session.open(link, station=station) as session:
         serial = _first(session, ELECTRODES, sensor, _NO_ELECTRODES).sensor_serial
         check(serial)
@@ -139,7 +149,13 @@ def record_presses(
             console.print("let go of the finger: it is tared", markup=False)
             tare_at_rest(session, sensor, interrupted, again_s=_AGAIN_S)
             if not interrupted.is_set():
-                _guide(session, sensor, presses, out, interrupted, console, check=recording.check)
+                count = _guide(
+                    session, sensor, presses, out, interrupted, console, check=recording.check
+                )
+        if interrupted.is_set() and count < least:
+            kept = f"the record is {recording.record}" if recording.record else "nothing is kept"
+            console.print(f"stopped after {count} presses; {kept}", markup=False, soft_wrap=True)
+            raise KeyboardInterrupt
         return recording.path(), serial
 
 
@@ -206,18 +222,23 @@ class _Recording:
         if self.failure is not None:
             raise self.failure
 
+    @property
+    def record(self) -> Path | None:
+        """The finished record; None = there is none."""
+        return self._records[-1] if self._records else None
+
     def path(self) -> Path:
-        """The finished record.
+        """The finished record, which must be there.
 
         Raises:
             RecordingError: There is none.
         """
         self.check()
-        if not self._records:
+        if self.record is None:
             raise RecordingError(
                 f"no record was written to {self._out}", remedy="check the disk's free space"
             )
-        return self._records[-1]
+        return self.record
 
 
 @contextlib.contextmanager
@@ -258,31 +279,44 @@ def _guide(
     console: Console,
     *,
     check: Callable[[], None],
-) -> None:
-    """Show what to press next until enough presses are recorded; ``check`` raises what is wrong."""
+) -> int:
+    """Show what to press next until enough presses are recorded; returns how many are.
+
+    ``check`` raises what is wrong.
+    """
     counter, hints = PressCounter(), itertools.cycle(HINTS)
     hint = next(hints)
     bar = Progress(
         TextColumn("press"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}")
     )
     task = bar.add_task("", total=presses)
-    lines_s = time.monotonic()
+    lines_s = seen_s = time.monotonic()
+    remedy = f"see palpate status; {out} keeps what was recorded, for --from"
     with (
+        session.subscriber(ELECTRODES, sensor=sensor) as frames,
         session.subscriber(WRENCH, sensor=sensor, delivery=Delivery.QUEUE) as forces,
-        Live(bar, console=console, refresh_per_second=10),
+        # In a file the bar would be the beginning of whatever is written next.
+        Live(bar, console=console, refresh_per_second=10, transient=not console.is_terminal),
     ):
         while counter.count < presses and not interrupted.is_set():
             batch = forces.next_batch(_SEEN_S)
             check()
             if not batch:
                 raise StreamTimeout(
-                    f"the force of {sensor!r} stopped for {_SEEN_S:g} s",
-                    remedy=f"see palpate status; {out} keeps what was recorded, for --from",
+                    f"the force of {sensor!r} stopped for {_SEEN_S:g} s", remedy=remedy
+                )
+            seen = any(_is_learned_from(one.message) for one in frames.next_batch(0.0))
+            if seen:
+                seen_s = time.monotonic()
+            elif time.monotonic() - seen_s > _SEEN_S:
+                raise StreamTimeout(
+                    f"no valid, tared electrodes of {sensor!r} came for {_SEEN_S:g} s",
+                    remedy=remedy,
                 )
             for received in batch:
                 wrench = received.message
                 force_n = float(np.linalg.norm(wrench.force))
-                if counter.take(1e-9 * wrench.stamp.monotonic_ns, force_n):
+                if counter.take(1e-9 * wrench.stamp.monotonic_ns, force_n, seen=seen):
                     hint = next(hints)
                     if not console.is_terminal:
                         console.print(
@@ -294,3 +328,8 @@ def _guide(
             if not console.is_terminal and time.monotonic() >= lines_s:
                 lines_s = time.monotonic() + _LINE_S
                 console.print(f"{force_n:.2f} N, next: {what}", markup=False)
+    return counter.count
+
+
+def _is_learned_from(frame: ElectrodeFrame) -> bool:
+    return frame.electrodes_valid and frame.tare_id != NO_TARE

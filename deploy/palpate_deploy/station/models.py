@@ -16,7 +16,7 @@ from palpate.bus import Session, endpoints
 from palpate.client.models import ModelAdmin
 from palpate.config import LinkConfig
 from palpate.errors import LinkError, PalpateError, printable
-from palpate.files.bundle import Bundle, read_bundle, read_manifest
+from palpate.files.bundle import Bundle, read_manifest
 from palpate.files.card import model_card
 from palpate.files.signature import sign_bundle
 from palpate.messages import ModelAction, ModelInventory, ServedModel
@@ -45,7 +45,7 @@ def list_models(folder: Path, *, as_json: bool) -> None:
     for name in repository.available():
         where = repository.resolve(name)
         try:
-            bundle = read_bundle(where)
+            bundle = repository.read(where)
         except PalpateError as error:
             rows.append({"bundle": name, "error": str(error)})
             continue
@@ -111,7 +111,8 @@ def print_card(name: str, folder: Path) -> None:
         ConfigError: There is no such bundle.
         BundleError: It is damaged.
     """
-    bundle = read_bundle(Repository(folder).resolve(name))
+    repository = Repository(folder)
+    bundle = repository.read(repository.resolve(name))
     print(model_card(bundle.manifest, bundle.sha256), end="")
 
 

@@ -8,6 +8,7 @@ the SHA-256 of the manifest's bytes and travels with each estimate.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import os
@@ -240,9 +241,11 @@ def write_bundle(
         files[RANGE] = known_inputs_to_bytes(known_inputs)
         manifest = replace(manifest, range_file_sha256=sha256_hex(files[RANGE]))
     text = manifest_to_bytes(manifest, folder / MANIFEST)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    had_parent = folder.parent.exists()
+    temporary: Path | None = None
     try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         for name, data in (*files.items(), (MANIFEST, text)):
             (temporary / name).write_bytes(data)
         temporary.chmod(0o755)
@@ -250,7 +253,11 @@ def write_bundle(
     except OSError as error:
         raise BundleError(f"cannot write {folder}: {error}", remedy="check the disk") from error
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+        if not had_parent:
+            with contextlib.suppress(OSError):  # of a bundle that is complete it is not empty
+                folder.parent.rmdir()
     return hashlib.sha256(text).digest()
 
 

@@ -92,12 +92,26 @@ class Repository:
         """Read a bundle and check its digests and, where keys are trusted, its signature.
 
         Raises:
-            BundleError: It is damaged, or its signature is missing or wrong.
+            BundleError: It is damaged, its signature is missing or wrong, or it lies in this
+                repository under a name or version that is not its own.
         """
         bundle = read_bundle(folder)
+        self._check_place(bundle)
         if not ships(folder):
             self._trusted.check(bundle)
         return bundle
+
+    def _check_place(self, bundle: Bundle) -> None:
+        """Refuse one that ``resolve`` finds by another name than it publishes with estimates."""
+        folder, manifest = bundle.folder, bundle.manifest
+        if folder.parent.parent.resolve() not in [one.resolve() for one in self._folders]:
+            return
+        place = (folder.parent.name, folder.name)
+        if _is_place(*place) and place != (manifest.name, str(manifest.version)):
+            raise BundleError(
+                f"{folder} holds {manifest.name}:{manifest.version}, so it lies in the wrong place",
+                remedy="move the folder elsewhere and take it from there: palpate model import",
+            )
 
     @classmethod
     def of_user(cls) -> Repository:
@@ -198,11 +212,14 @@ class Repository:
         for models in self._folders:
             for folder in models.glob("*/*"):
                 name, version = folder.parent.name, folder.name
-                if not (_VERSION.fullmatch(version) and _NAME.fullmatch(name)):
-                    continue
-                if (folder / MANIFEST).is_file():
+                if _is_place(name, version) and (folder / MANIFEST).is_file():
                     found.setdefault((name, int(version)), folder)
         return found
+
+
+def _is_place(name: str, version: str) -> bool:
+    """Whether a repository has bundles in ``name/version``."""
+    return bool(_VERSION.fullmatch(version) and _NAME.fullmatch(name))
 
 
 def _task_of(folder: Path) -> str | None:

@@ -116,7 +116,12 @@ def data_inspect(
         data = open_dataset(path)
         show(as_json, lambda: _features_summary(data), lambda: contents(data, str(path)))
         return
-    kind, experiment = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
+    kind, experiment = load(
+        path,
+        axes=axes.split(","),
+        force_on_indenter=force_on_indenter,
+        others=(FEATURES_SCHEMA.name, TRIALS_SCHEMA.name),
+    )
     found = experiment_contents(kind, experiment)
     show(as_json, lambda: asdict(found), lambda: experiment_table(found, str(path)))
 

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
-from palpate.files.bundle import read_bundle
+from palpate.files.bundle import read_bundle, read_manifest
 from palpate.files.card import model_card
 from palpate.process import told_in_log, typed_command
 from palpate_training.datasets.features import open_dataset
@@ -498,6 +498,14 @@ def train_upgrade(
     chosen = tuple(unit.strip() for unit in units.split(",") if unit.strip())
     digest = upgrade_bundle(bundle, data, out, units=chosen)
     console.print(f"wrote {out}, digest {digest.hex()}")
+    manifest = read_manifest(out)
+    known = manifest.training_range
+    if known is not None and known.data_sha256 != manifest.training_data_sha256:
+        console.print(
+            f"its range is of {data}, which is not what it was trained on: palpate train intervals"
+            " cannot tell presses that its training saw, so hold out those that it did not",
+            markup=False,
+        )
 
 
 def train_intervals(
@@ -529,10 +537,10 @@ def train_intervals(
 
 
 def _version(given: int | None, out: Path) -> int:
-    """Of a bundle in a folder: a repository takes the folder's name for it."""
-    if given is not None:
-        return given
-    return int(out.name) if out.name.isdecimal() and int(out.name) > 0 else 1
+    """Of a bundle in a folder, unless it is given."""
+    from palpate_training.learning.export import version_of
+
+    return version_of(out, 1) if given is None else given
 
 
 def _bundle(

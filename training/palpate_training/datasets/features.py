@@ -242,6 +242,51 @@ OF_CONTACT = ("contact_location", "centre_of_pressure", "contact_normal")
 """Columns that only a contact has."""
 
 
+def check_rest(rest: npt.NDArray[np.floating], rows: npt.NDArray[np.int64], name: str) -> None:
+    """Refuse untouched counts that no BioTac sends.
+
+    Args:
+        rest: Of each row [counts], shape ``(N, 19)``.
+        rows: Their numbers in the file, shape ``(N,)``.
+        name: Of the file.
+
+    Raises:
+        DatasetError: Some are below 0 or above ``COUNTS_MAX``, or those of a row are all 0.
+    """
+    bad = (rest < 0.0) | (rest > COUNTS_MAX)
+    bad |= ~rest.any(axis=1, keepdims=True)  # of counts from which the rest was subtracted
+    if bad.any():
+        row, electrode = (int(index) for index in np.argwhere(bad)[0])
+        raise DatasetError(
+            f"{name}: the rest of E{electrode + 1} is {rest[row, electrode]:g} in row"
+            f" {rows[row]}, not untouched counts (0 to {COUNTS_MAX}, not all 0)",
+            remedy="give raw counts of the untouched BioTac, nothing subtracted or scaled",
+        )
+
+
+FORCE_MOST_N = 300.0
+"""A longer force is no reading of a fingertip's, or not in newtons [N]. A BioTac breaks far below,
+and a zeroed force/torque sensor is off by some newtons; but a press that counts, of 0.5 N, is 500
+in mN."""
+
+
+def check_forces(force: npt.NDArray[np.floating], rows: npt.NDArray[np.int64], name: str) -> None:
+    """Refuse forces that no fingertip bears; arguments as of ``check_rest``.
+
+    Raises:
+        DatasetError: One is longer than ``FORCE_MOST_N``.
+    """
+    length = np.linalg.norm(force.astype(np.float64), axis=1)
+    over = np.flatnonzero(length > FORCE_MOST_N)
+    if over.size:
+        raise DatasetError(
+            f"{name}: the force is {length[over[0]]:.4g} N in row {rows[over[0]]}, more than a"
+            f" fingertip bears ({over.size} rows above {FORCE_MOST_N:g} N)",
+            remedy="give newtons (a table in mN says so in its column map: force_unit), and drop"
+            " rows that the force sensor did not measure",
+        )
+
+
 def _check_shapes(data: FeatureDataset) -> None:
     rows = len(data.electrodes)
     if rows == 0:
@@ -280,6 +325,7 @@ def _check_values(data: FeatureDataset) -> None:
                 f"{data.name}: {name} is not finite in row {bad[0]} ({bad.size} rows in all)",
                 remedy="drop these rows where the data set is made",
             )
+    check_rest(data.baseline, np.arange(len(data)), data.name)
     if data.contact_normal is not None:
         length = np.linalg.norm(data.contact_normal[touching], axis=1)
         wrong = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
@@ -312,22 +358,13 @@ def _check_values(data: FeatureDataset) -> None:
         )
 
 
-FORCE_MOST_N = 1e4
-"""No fingertip bears more: such a reading is none [N]."""
-
-
 def check_learnable(data: FeatureDataset) -> None:
     """Refuse rows that nothing can be learned from, before time is spent on it.
 
     Raises:
         DatasetError: A force is beyond ``FORCE_MOST_N``, or force or electrodes never change.
     """
-    row, axis = np.unravel_index(np.argmax(np.abs(data.force)), data.force.shape)
-    if abs(data.force[row, axis]) > FORCE_MOST_N:
-        raise DatasetError(
-            f"{data.name}: force {'xyz'[axis]} is {data.force[row, axis]:.3g} N in row {row}",
-            remedy="give newtons, and drop rows that the force sensor did not measure",
-        )
+    check_forces(data.force, np.arange(len(data)), data.name)
     for name, values in (("force", data.force), ("electrodes, tared,", data.tared_counts)):
         if not np.ptp(values, axis=0).any():
             raise DatasetError(

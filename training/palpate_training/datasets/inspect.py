@@ -83,7 +83,11 @@ class ExperimentContents:
 
 
 def load(
-    path: Path, *, axes: Sequence[str] = ("x", "y", "z"), force_on_indenter: bool = False
+    path: Path,
+    *,
+    axes: Sequence[str] = ("x", "y", "z"),
+    force_on_indenter: bool = False,
+    others: Sequence[str] = (),
 ) -> tuple[str, ExperimentDataset | MixedDataset]:
     """Read whatever lies there, and say what it is: either schema, or a folder of published files.
 
@@ -92,6 +96,7 @@ def load(
             that are there are read.
         axes: Of published files, as in ``read_published``.
         force_on_indenter: Likewise.
+        others: Schemas that the caller takes, too, for the error.
 
     Raises:
         DatasetError: It is none of these, or damaged.
@@ -111,9 +116,9 @@ def load(
         return schema, read_experiment(path)
     if schema == MIXED_SCHEMA.name:
         return schema, read_mixed(path)
+    *first, last = map(repr, (*others, EXPERIMENT_SCHEMA.name, MIXED_SCHEMA.name))
     raise DatasetError(
-        f"{path}: schema is {schema or 'not stated'!r}, expected {EXPERIMENT_SCHEMA.name!r} or"
-        f" {MIXED_SCHEMA.name!r}",
+        f"{path}: schema is {schema or 'not stated'!r}, expected {', '.join(first)} or {last}",
         remedy="give a file that palpate wrote, or the folder with biotac1.hdf5 and so on",
     )
 

@@ -31,6 +31,8 @@ from palpate_training.datasets.features import (
     FEATURE_COLUMNS,
     OF_CONTACT,
     FeatureDataset,
+    check_forces,
+    check_rest,
     cut_into_blocks,
 )
 from palpate_training.datasets.table_columns import MISSING, Columns, TableColumns, Values
@@ -289,8 +291,9 @@ def dataset_of(
 
     Raises:
         DatasetError: A column is missing, there twice, of another width, or holds something else; a
-            number is missing; electrodes are no whole counts, the rest no counts; nothing says what
-            electrodes read untouched; rows of a press are not in order of time.
+            number is missing; electrodes are no whole counts, the rest no counts; a force is beyond
+            ``FORCE_MOST_N``; nothing says what electrodes read untouched; rows of a press are not
+            in order of time.
     """
     reader = TableColumns(table, source)
     arrays: dict[str, Any] = {
@@ -316,7 +319,8 @@ def dataset_of(
     arrays["electrodes"] = _counts(arrays["electrodes"], np.flatnonzero(kept), source)
     if "baseline" not in arrays:
         arrays["baseline"] = _rest(arrays, columns.rest_rows, np.flatnonzero(kept), source)
-    _check_rest(arrays["baseline"], np.flatnonzero(kept), source)
+    check_rest(arrays["baseline"], np.flatnonzero(kept), str(source))
+    check_forces(arrays["force"], np.flatnonzero(kept), str(source))
     ours = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
     across = columns.groups_across_sensors or ours
     arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
@@ -417,19 +421,6 @@ def _counts(values: Values, rows: npt.NDArray[np.int64], source: Path) -> Values
             remedy="give raw counts as the BioTac sends them, nothing subtracted or scaled",
         )
     return np.asarray(counts)
-
-
-def _check_rest(rest: Values, rows: npt.NDArray[np.int64], source: Path) -> None:
-    """Refuse untouched counts that no BioTac sends; ``rows`` are those of the table."""
-    bad = (rest < 0.0) | (rest > COUNTS_MAX)
-    bad |= ~rest.any(axis=1, keepdims=True)  # of counts from which the rest was subtracted
-    if bad.any():
-        row, electrode = (int(index) for index in np.argwhere(bad)[0])
-        raise DatasetError(
-            f"{source}: the rest of E{electrode + 1} is {rest[row, electrode]:g} in row"
-            f" {rows[row]}, not untouched counts (0 to {COUNTS_MAX}, not all 0)",
-            remedy="give raw counts of the untouched BioTac, nothing subtracted or scaled",
-        )
 
 
 def _rest(

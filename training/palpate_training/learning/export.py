@@ -64,6 +64,15 @@ def refuse_existing(folder: Path, name: str | None = None) -> None:
         )
 
 
+def version_of(folder: Path, otherwise: int) -> int:
+    """Version of a bundle that is written to a folder: its name, if that is a number.
+
+    A repository takes the folder's name for the version, so the manifest must say the same.
+    """
+    name = folder.name
+    return int(name) if name.isdecimal() and int(name) > 0 else otherwise
+
+
 def export_features(
     folder: Path,
     graph: FeaturesGraph,

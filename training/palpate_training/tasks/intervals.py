@@ -22,7 +22,7 @@ from palpate.files.training_range import KnownInputs
 from palpate_training.datasets.container import refuse_repeated
 from palpate_training.datasets.experiment import MixedDataset, content_sha256, read_mixed
 from palpate_training.datasets.features import FeatureDataset, FloatArray, open_dataset, press_of
-from palpate_training.learning.export import refuse_existing
+from palpate_training.learning.export import refuse_existing, version_of
 from palpate_training.learning.field_code import in_parts
 from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
 from palpate_training.learning.metrics import field_errors, force_errors, join, location_errors
@@ -175,12 +175,11 @@ def add_intervals(
         other,
         other_source,
     )
-    version = int(out.name) if out.name.isdigit() else manifest.version
     return write_bundle(
         out,
         model=bundle.model,
         golden=bundle.golden,
-        manifest=replace(manifest, intervals=intervals, version=version),
+        manifest=replace(manifest, intervals=intervals, version=version_of(out, manifest.version)),
         mesh=bundle.mesh,
         known_inputs=known,
     )

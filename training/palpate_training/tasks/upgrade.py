@@ -1,7 +1,9 @@
 """An older bundle with what newer ones say: its training range, and of a field its coefficients.
 
 The weights stay what they are, so do its answers and its metrics. The data set should be the one
-that it was trained on; where that is gone, one of the same experiment, and the range says so.
+that it was trained on; where that is gone, one of the same experiment, and the range says so. A
+bundle that knows its rows is refused: bounds of errors hold with the distances that they were
+learned with, and presses are known to be held out by the rows that were trained on.
 """
 
 from __future__ import annotations
@@ -20,7 +22,13 @@ from palpate.files.training_range import KnownInputs
 from palpate.process import require
 from palpate_training.datasets.experiment import MixedDataset, read_mixed
 from palpate_training.datasets.features import open_dataset, press_of
-from palpate_training.learning.export import PARITY_MAX, basis_of, refuse_existing, run_onnx
+from palpate_training.learning.export import (
+    PARITY_MAX,
+    basis_of,
+    refuse_existing,
+    run_onnx,
+    version_of,
+)
 from palpate_training.learning.ranges import known_inputs
 from palpate_training.learning.splits import Rows
 from palpate_training.tasks.features import features_range
@@ -36,16 +44,18 @@ def upgrade_bundle(old: Path, data: Path, out: Path, *, units: Sequence[str] = (
     Args:
         old: Folder of the bundle.
         data: Data set of features, or a mixed one, as its training takes it.
-        out: Folder to write; must not exist.
+        out: Folder to write; must not exist. A number is the version.
         units: Specimens of a mixed data set that it was trained on; empty = all.
 
     Raises:
-        BundleError: It breaks its contract, ``out`` exists, or the rows are of another fingertip.
+        BundleError: It breaks its contract, knows its training rows already, ``out`` exists, or the
+            rows are of another fingertip.
         DatasetError: The data set breaks its schema.
         ConfigError: Specimens are named for a bundle of features.
     """
     refuse_existing(out)
     bundle = read_bundle(old)
+    _check_older(bundle)
     known: KnownInputs | None = None
     if bundle.manifest.task == "features":
         if units:
@@ -73,10 +83,26 @@ def upgrade_bundle(old: Path, data: Path, out: Path, *, units: Sequence[str] = (
         out,
         model=bundle.model,
         golden=bundle.golden,
-        manifest=replace(bundle.manifest, training_range=found),
+        manifest=replace(
+            bundle.manifest,
+            training_range=found,
+            version=version_of(out, bundle.manifest.version),
+        ),
         mesh=bundle.mesh,
         known_inputs=known,
     )
+
+
+def _check_older(bundle: Bundle) -> None:
+    """Refuse a bundle that has all that an upgrade adds."""
+    manifest = bundle.manifest
+    # Synthesis is told the ends of its values alone.
+    has_range = manifest.task == "synthesis" and manifest.training_range is not None
+    if has_range or bundle.known_inputs is not None:
+        raise BundleError(
+            f"{bundle.folder} knows already what it was trained on",
+            remedy="keep it as it is; bounds of its errors are added by palpate train intervals",
+        )
 
 
 def _rows_of(data: MixedDataset, units: Sequence[str]) -> Rows:
