@@ -10,7 +10,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +20,10 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from palpate.bus import Delivery, Session
+from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.topics import FEATURES
 from palpate.errors import LinkError, StreamTimeout
+from palpate.messages import ServiceRequest
 from palpate_deploy.bench.station import wait_ready
 from palpate_deploy.station.host import join, private_profile, write_profile
 from palpate_deploy.station.processes import FiniteRun
@@ -33,7 +34,13 @@ RATE_HZ = 100.0
 FORGED_TICK = 1 << 60
 """The device's counter in frames that a stranger sends: no device has counted so far."""
 
+RECOVERY_S = 20.0
+"""How long a trial waits for a station to recover [s]."""
+
 _PATIENCE_S = 30.0
+
+Figures = dict[str, float | int | str]
+"""What a trial measured; names end in the unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +66,15 @@ class EstimateAccount:
     p99_s: float
     youngest_s: float
     longest_gap_s: float
+
+    def figures(self) -> Figures:
+        """Those figures that every row shows."""
+        return {
+            "estimates": self.received,
+            "lost": self.lost,
+            "p99_s": self.p99_s,
+            "longest_gap_s": self.longest_gap_s,
+        }
 
 
 def account_of(received: npt.NDArray[np.int64]) -> EstimateAccount:
@@ -212,6 +228,22 @@ class FaultStation:
         """Stop a process; its exit status."""
         return self._run.stop_one(name)
 
+    def counters(self, service: str) -> dict[str, int]:
+        """What a service has counted so far."""
+        status = self.observer.session.query(
+            endpoints.STATUS, ServiceRequest(), service=service, timeout_s=5.0
+        )
+        return dict(status.counters)
+
+    def refusals(self) -> str:
+        """What the features service has counted beside the good frames, for people."""
+        usual = ("frames_received", "estimates_published", "untared")
+        return ", ".join(
+            f"{name} {count}"
+            for name, count in sorted(self.counters("features").items())
+            if count and name not in usual
+        )
+
     @contextmanager
     def fresh_session(self) -> Iterator[Session]:
         """A session that knows nothing yet, as a robot that has just been switched on."""
@@ -235,3 +267,13 @@ def resident_bytes(pid: int) -> int:
     """Resident memory of a process [bytes]."""
     pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def seconds_until(true: Callable[[], bool]) -> float:
+    """Time until something holds [s]; infinity if it does not within ``RECOVERY_S``."""
+    began_s = time.monotonic()
+    while not true():
+        if time.monotonic() - began_s > RECOVERY_S:
+            return float("inf")
+        time.sleep(0.005)
+    return time.monotonic() - began_s
