@@ -52,8 +52,7 @@ class EstimateAccount:
         lost: Frames of the device without an estimate, between the first and the last.
         forged: Estimates of frames that the device did not take, see ``FORGED_TICK``.
         disordered: Estimates whose frame is not newer than the one before.
-        p50_s: Median age at arrival, from the frame's stamp [s].
-        p99_s: 99th percentile of it [s].
+        p99_s: 99th percentile of the age at arrival, from the frame's stamp [s].
         youngest_s: Least age; negative = a stamp from the future [s].
         longest_gap_s: Longest time between two arrivals [s].
     """
@@ -62,7 +61,6 @@ class EstimateAccount:
     lost: int
     forged: int
     disordered: int
-    p50_s: float
     p99_s: float
     youngest_s: float
     longest_gap_s: float
@@ -82,17 +80,15 @@ def account_of(received: npt.NDArray[np.int64]) -> EstimateAccount:
     rows = received[received[:, 0] < FORGED_TICK]
     forged = len(received) - len(rows)
     if len(rows) < 2:
-        return EstimateAccount(len(rows), 0, forged, 0, 0.0, 0.0, 0.0, 0.0)
+        return EstimateAccount(len(rows), 0, forged, 0, 0.0, 0.0, 0.0)
     steps = np.diff(rows[:, 0])
     ages_s = (rows[:, 2] - rows[:, 1]) * 1e-9
-    p50, p99 = np.percentile(ages_s, (50, 99))
     return EstimateAccount(
         len(rows),
         int(np.maximum(steps - 1, 0).sum()),
         forged,
         int((steps <= 0).sum()),
-        float(p50),
-        float(p99),
+        float(np.percentile(ages_s, 99)),
         float(ages_s.min()),
         float(np.diff(rows[:, 2]).max() * 1e-9),
     )
@@ -123,7 +119,7 @@ class EstimateObserver:
         self.wait_for_next()
         return len(self._rows)
 
-    def wait_for_next(self, *, taken_after_ns: int = 0, timeout_s: float = _PATIENCE_S) -> float:
+    def wait_for_next(self, *, taken_after_ns: int = 0) -> float:
         """Wait for an estimate that is not received yet, of a frame taken after a time; how long.
 
         Raises:
@@ -131,17 +127,17 @@ class EstimateObserver:
         """
         began_s, seen = time.monotonic(), len(self._rows)
         while not any(row[1] > taken_after_ns for row in self._rows[seen:]):
-            if time.monotonic() - began_s > timeout_s:
+            if time.monotonic() - began_s > _PATIENCE_S:
                 raise LinkError(
-                    f"no estimate of {SENSOR!r} for {timeout_s:g} s",
+                    f"no estimate of {SENSOR!r} for {_PATIENCE_S:g} s",
                     remedy="see the logs in the folder of the run",
                 )
             time.sleep(0.002)
         return time.monotonic() - began_s
 
-    def account(self, since: int, until: int | None = None) -> EstimateAccount:
-        """Account for the estimates between two marks; None = up to now."""
-        return account_of(np.array(self._rows[since:until], np.int64).reshape(-1, 3))
+    def account(self, since: int) -> EstimateAccount:
+        """Account for the estimates since a mark."""
+        return account_of(np.array(self._rows[since:], np.int64).reshape(-1, 3))
 
     def close(self) -> None:
         """Stop receiving and leave the bus."""

@@ -198,27 +198,3 @@ def _followed(goal: Floats, ways: Floats, start: Floats) -> Floats:
 
 PDC_PA = 36.5
 """Pressure of one count of PDC [Pa]."""
-
-PAC_PA = 0.37
-"""Pressure of one count of PAC [Pa]."""
-
-KELVIN = 273.15
-# A thermistor of 0.6444 exp(4025 / T) Ohm against 30 kOhm; the maker states the result in this
-# form.
-BETA_K, UPPER, LOWER = 4025.0, 155183.0, 46555.0
-
-
-def pressure_of_pdc(counts: Floats, specimen: SpecimenParameters) -> Floats:
-    """Fluid pressure above ambient [Pa] for PDC [counts], any shape."""
-    return np.asarray((np.asarray(counts, np.float64) - specimen.pdc_offset) * PDC_PA)
-
-
-def pressure_of_pac(counts: Floats, specimen: SpecimenParameters) -> Floats:
-    """Vibration of the fluid pressure above 10 Hz [Pa] for PAC [counts], any shape."""
-    return np.asarray((np.asarray(counts, np.float64) - specimen.pac_offset) * PAC_PA)
-
-
-def temperature_of_tdc(counts: Floats) -> Floats:
-    """Core temperature [degrees C] for TDC [counts] in 1..4095, any shape."""
-    x = np.asarray(counts, np.float64) / FULL_SCALE
-    return np.asarray(BETA_K / np.log((UPPER - LOWER * x) / x) - KELVIN)
