@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from palpate.anatomy import spatial_modes
 from palpate.errors import ConfigError
 from palpate_fem.electrodes.electronics import (
     Counts,
@@ -24,7 +25,6 @@ from palpate_fem.electrodes.electronics import (
     log_sigma,
     skewed,
     slot_offsets_s,
-    spatial_modes,
 )
 from palpate_fem.electrodes.specimen import LIMITS, SpecimenParameters
 

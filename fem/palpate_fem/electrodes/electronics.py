@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.anatomy import ELECTRODE_POSITIONS
+from palpate.anatomy import spatial_modes
 from palpate_fem.electrodes.specimen import SENSING, SpecimenParameters
 
 Floats = NDArray[np.float64]
@@ -77,16 +77,6 @@ def core_temperature_c(since_on_s: float, ambient_c: float, specimen: SpecimenPa
 def log_sigma(temperature_c: float, specimen: SpecimenParameters) -> float:
     """Logarithm of the conductivity over its value at the reference temperature."""
     return specimen.temperature_coefficient * (temperature_c - specimen.reference_c)
-
-
-def spatial_modes() -> Floats:
-    """Two smooth modes over the electrodes, shape (2, 19): along the finger, and to the sides.
-
-    Both have zero mean and unit mean square, so `gradient_sd` is the deviation of one electrode.
-    """
-    raw = np.stack([ELECTRODE_POSITIONS[:, 0], np.abs(ELECTRODE_POSITIONS[:, 1])])
-    raw = raw - raw.mean(axis=1, keepdims=True)
-    return np.asarray(raw / raw.std(axis=1, keepdims=True))
 
 
 FRAME_S = 10e-3
