@@ -100,3 +100,13 @@ def core_normal(points: NDArray[np.floating]) -> Floats:
     radial[:, 0] = np.maximum(radial[:, 0], 0.0)
     length = np.linalg.norm(radial, axis=1, keepdims=True)
     return np.asarray(radial / np.where(length > 0, length, 1.0))
+
+
+def spatial_modes() -> Floats:
+    """Two smooth modes over E1..E19, shape (2, 19): along the finger, and to the sides.
+
+    Both have zero mean and unit mean square, so a mode's factor is the deviation of an electrode.
+    """
+    raw = np.stack([ELECTRODE_POSITIONS[:, 0], np.abs(ELECTRODE_POSITIONS[:, 1])])
+    raw = raw - raw.mean(axis=1, keepdims=True)
+    return np.asarray(raw / raw.std(axis=1, keepdims=True))

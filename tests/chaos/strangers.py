@@ -28,7 +28,7 @@ from palpate.codec import SIMULATION_REQUEST
 from palpate.config import joining_link
 from palpate.errors import StreamTimeout
 from palpate.messages import SimulationRequest
-from palpate_deploy.bench.faults import reply_code
+from palpate_deploy.bench.strangers import reply_code
 
 MANY = 400
 FRAMES, FRAMES_HZ = 5000, 1000.0

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from palpate.anatomy import spatial_modes
 from palpate.errors import ConfigError
 from palpate_fem.electrodes.electronics import (
     Counts,
@@ -22,12 +23,8 @@ from palpate_fem.electrodes.electronics import (
     ideal_counts,
     impedance_of,
     log_sigma,
-    pressure_of_pac,
-    pressure_of_pdc,
     skewed,
     slot_offsets_s,
-    spatial_modes,
-    temperature_of_tdc,
 )
 from palpate_fem.electrodes.specimen import LIMITS, SpecimenParameters
 
@@ -212,21 +209,3 @@ def test_electrodes_of_a_frame_are_read_one_after_the_other() -> None:
     seen = skewed(ramp, time_s)
     np.testing.assert_allclose(seen[:-1], ramp[:-1] + 300.0 * offsets)
     np.testing.assert_array_equal(seen[-1], ramp[-1])
-
-
-@pytest.mark.parametrize(
-    ("counts", "degrees_c"), [(1000, 29.8), (1500, 40.3), (2000, 48.6), (2500, 55.6), (3100, 63.0)]
-)
-def test_temperatures_of_the_hardware_reference(counts: int, degrees_c: float) -> None:
-    found = temperature_of_tdc(np.array(float(counts)))
-    assert found == pytest.approx(degrees_c, abs=0.05)
-
-
-def test_channels_say_what_was_measured() -> None:
-    """Section 4.5: 46-49 C at 1825-2045 counts; section 4.6: a plate of 21-25 kPa, 590-670."""
-    low, high = temperature_of_tdc(np.array([1825.0, 2045.0]))
-    assert 45.5 < low < 47
-    assert 48 < high < 53
-    pressed = pressure_of_pdc(UNIT.pdc_offset + np.array([590.0, 670.0]), UNIT)
-    assert 21e3 < pressed[0] < pressed[1] < 25e3
-    assert pressure_of_pac(np.array([UNIT.pac_offset + 1]), UNIT) == pytest.approx(0.37)

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from tests.fem.quad_sphere import quad_sphere
 
 from palpate.errors import ConfigError, SimulationError
 from palpate.rigid import facing, rotation_matrices, to_local, unit
@@ -34,20 +35,9 @@ def plate(height_m: float, count: int = 41, half_m: float = 12e-3) -> OuterSurfa
 
 
 def ball(radius_m: float, count: int = 33) -> OuterSurface:
-    """A sphere about the origin, a cube of quads blown up."""
-    nodes: list[Floats] = []
-    faces: list[NDArray[np.int64]] = []
-    part = np.tan(np.linspace(-np.pi / 4, np.pi / 4, count))
-    u, v = (grid.ravel() for grid in np.meshgrid(part, part, indexing="ij"))
-    first = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
-    for axis in range(3):
-        for side in (-1.0, 1.0):
-            face = np.empty((len(u), 3))
-            face[:, axis], face[:, (axis + 1) % 3], face[:, (axis + 2) % 3] = side, u, v
-            quads = np.stack([first, first + count, first + count + 1, first + 1], axis=1)
-            faces.append((quads if side > 0 else quads[:, ::-1]) + len(nodes) * len(u))
-            nodes.append(radius_m * face / np.linalg.norm(face, axis=1, keepdims=True))
-    return OuterSurface(np.concatenate(nodes), np.concatenate(faces).astype(np.int32))
+    """A sphere about the origin."""
+    nodes, faces = quad_sphere(count)
+    return OuterSurface(radius_m * nodes, faces)
 
 
 @pytest.mark.parametrize("name", indenter_names())

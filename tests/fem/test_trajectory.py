@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.fem.quad_sphere import quad_sphere
 
 from palpate.errors import ConfigError, SimulationError
 from palpate.rigid import path_lengths, rotation_matrices
@@ -37,23 +38,10 @@ PAD = np.array([0.0, 0.0, -1.0])
 
 
 def make_finger(count: int = 25) -> OuterSurface:
-    """An ellipsoid as long and thick as a fingertip, made of a cube of quads."""
-    nodes: list[Floats] = []
-    faces: list[NDArray[np.int64]] = []
-    part = np.tan(np.linspace(-np.pi / 4, np.pi / 4, count))
-    u, v = (grid.ravel() for grid in np.meshgrid(part, part, indexing="ij"))
-    first = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
-    quads = np.stack([first, first + count, first + count + 1, first + 1], axis=1)
-    for axis in range(3):
-        for side in (-1.0, 1.0):
-            face = np.empty((len(u), 3))
-            face[:, axis], face[:, (axis + 1) % 3], face[:, (axis + 2) % 3] = side, u, v
-            faces.append((quads if side > 0 else quads[:, ::-1]) + len(nodes) * len(u))
-            nodes.append(face / np.linalg.norm(face, axis=1, keepdims=True))
+    """An ellipsoid as long and thick as a fingertip."""
+    nodes, faces = quad_sphere(count)
     scale, centre = np.array([14e-3, 7.1e-3, 7.5e-3]), np.array([-7.3e-3, 0.0, -0.8e-3])
-    return OuterSurface(
-        np.concatenate(nodes) * scale + centre, np.concatenate(faces).astype(np.int32)
-    )
+    return OuterSurface(nodes * scale + centre, faces)
 
 
 FINGER = make_finger()

@@ -25,7 +25,7 @@ LINTER: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encod
 # Packages with one home.  import-linter can forbid a package to a room but cannot say "only here".
 # What the bare floor of the benchmark uses, because it must not use palpate's own code.
 FLOOR = "deploy/palpate_deploy/bench/floor.py"
-STRANGER = "deploy/palpate_deploy/bench/faults.py"  # keeps to no contract
+STRANGER = "deploy/palpate_deploy/bench/strangers.py"  # keeps to no contract
 
 HOMES = {
     "zenoh": ("protos/palpate/bus/", FLOOR, STRANGER),

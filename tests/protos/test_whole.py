@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -32,6 +32,21 @@ def test_what_fails_half_way_leaves_the_old_file_and_nothing_else(tmp_path: Path
         fail()
     assert path.read_text(encoding="utf-8") == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_appears_whole_too(tmp_path: Path) -> None:
+    def write(path: Path, *, fails: bool) -> None:
+        with written_whole(path) as partial:
+            partial.mkdir()
+            (partial / "file.txt").write_text("whole", encoding="utf-8")
+            if fails:
+                raise KeyError("mine")
+
+    write(tmp_path / "good", fails=False)
+    with pytest.raises(KeyError, match="mine"):
+        write(tmp_path / "bad", fails=True)
+    assert list(tmp_path.iterdir()) == [tmp_path / "good"]
+    assert (tmp_path / "good" / "file.txt").read_text(encoding="utf-8") == "whole"
 
 
 def test_a_disk_that_refuses_is_named(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +20,10 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from palpate.bus import Delivery, Session
+from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.topics import FEATURES
 from palpate.errors import LinkError, StreamTimeout
+from palpate.messages import ServiceRequest
 from palpate_deploy.bench.station import wait_ready
 from palpate_deploy.station.host import join, private_profile, write_profile
 from palpate_deploy.station.processes import FiniteRun
@@ -33,7 +34,13 @@ RATE_HZ = 100.0
 FORGED_TICK = 1 << 60
 """The device's counter in frames that a stranger sends: no device has counted so far."""
 
+RECOVERY_S = 20.0
+"""How long a trial waits for a station to recover [s]."""
+
 _PATIENCE_S = 30.0
+
+Figures = dict[str, float | int | str]
+"""What a trial measured; names end in the unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +52,7 @@ class EstimateAccount:
         lost: Frames of the device without an estimate, between the first and the last.
         forged: Estimates of frames that the device did not take, see ``FORGED_TICK``.
         disordered: Estimates whose frame is not newer than the one before.
-        p50_s: Median age at arrival, from the frame's stamp [s].
-        p99_s: 99th percentile of it [s].
+        p99_s: 99th percentile of the age at arrival, from the frame's stamp [s].
         youngest_s: Least age; negative = a stamp from the future [s].
         longest_gap_s: Longest time between two arrivals [s].
     """
@@ -55,10 +61,18 @@ class EstimateAccount:
     lost: int
     forged: int
     disordered: int
-    p50_s: float
     p99_s: float
     youngest_s: float
     longest_gap_s: float
+
+    def figures(self) -> Figures:
+        """Those figures that every row shows."""
+        return {
+            "estimates": self.received,
+            "lost": self.lost,
+            "p99_s": self.p99_s,
+            "longest_gap_s": self.longest_gap_s,
+        }
 
 
 def account_of(received: npt.NDArray[np.int64]) -> EstimateAccount:
@@ -66,17 +80,15 @@ def account_of(received: npt.NDArray[np.int64]) -> EstimateAccount:
     rows = received[received[:, 0] < FORGED_TICK]
     forged = len(received) - len(rows)
     if len(rows) < 2:
-        return EstimateAccount(len(rows), 0, forged, 0, 0.0, 0.0, 0.0, 0.0)
+        return EstimateAccount(len(rows), 0, forged, 0, 0.0, 0.0, 0.0)
     steps = np.diff(rows[:, 0])
     ages_s = (rows[:, 2] - rows[:, 1]) * 1e-9
-    p50, p99 = np.percentile(ages_s, (50, 99))
     return EstimateAccount(
         len(rows),
         int(np.maximum(steps - 1, 0).sum()),
         forged,
         int((steps <= 0).sum()),
-        float(p50),
-        float(p99),
+        float(np.percentile(ages_s, 99)),
         float(ages_s.min()),
         float(np.diff(rows[:, 2]).max() * 1e-9),
     )
@@ -107,7 +119,7 @@ class EstimateObserver:
         self.wait_for_next()
         return len(self._rows)
 
-    def wait_for_next(self, *, taken_after_ns: int = 0, timeout_s: float = _PATIENCE_S) -> float:
+    def wait_for_next(self, *, taken_after_ns: int = 0) -> float:
         """Wait for an estimate that is not received yet, of a frame taken after a time; how long.
 
         Raises:
@@ -115,17 +127,17 @@ class EstimateObserver:
         """
         began_s, seen = time.monotonic(), len(self._rows)
         while not any(row[1] > taken_after_ns for row in self._rows[seen:]):
-            if time.monotonic() - began_s > timeout_s:
+            if time.monotonic() - began_s > _PATIENCE_S:
                 raise LinkError(
-                    f"no estimate of {SENSOR!r} for {timeout_s:g} s",
+                    f"no estimate of {SENSOR!r} for {_PATIENCE_S:g} s",
                     remedy="see the logs in the folder of the run",
                 )
             time.sleep(0.002)
         return time.monotonic() - began_s
 
-    def account(self, since: int, until: int | None = None) -> EstimateAccount:
-        """Account for the estimates between two marks; None = up to now."""
-        return account_of(np.array(self._rows[since:until], np.int64).reshape(-1, 3))
+    def account(self, since: int) -> EstimateAccount:
+        """Account for the estimates since a mark."""
+        return account_of(np.array(self._rows[since:], np.int64).reshape(-1, 3))
 
     def close(self) -> None:
         """Stop receiving and leave the bus."""
@@ -212,6 +224,22 @@ class FaultStation:
         """Stop a process; its exit status."""
         return self._run.stop_one(name)
 
+    def counters(self, service: str) -> dict[str, int]:
+        """What a service has counted so far."""
+        status = self.observer.session.query(
+            endpoints.STATUS, ServiceRequest(), service=service, timeout_s=5.0
+        )
+        return dict(status.counters)
+
+    def refusals(self) -> str:
+        """What the features service has counted beside the good frames, for people."""
+        usual = ("frames_received", "estimates_published", "untared")
+        return ", ".join(
+            f"{name} {count}"
+            for name, count in sorted(self.counters("features").items())
+            if count and name not in usual
+        )
+
     @contextmanager
     def fresh_session(self) -> Iterator[Session]:
         """A session that knows nothing yet, as a robot that has just been switched on."""
@@ -235,3 +263,13 @@ def resident_bytes(pid: int) -> int:
     """Resident memory of a process [bytes]."""
     pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def seconds_until(true: Callable[[], bool]) -> float:
+    """Time until something holds [s]; infinity if it does not within ``RECOVERY_S``."""
+    began_s = time.monotonic()
+    while not true():
+        if time.monotonic() - began_s > RECOVERY_S:
+            return float("inf")
+        time.sleep(0.005)
+    return time.monotonic() - began_s

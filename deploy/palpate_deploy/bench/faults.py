@@ -8,48 +8,36 @@ benchmark of their own (``palpate bench restart``), as have exchanged models (``
 from __future__ import annotations
 
 import contextlib
-import random
 import resource
 import signal
 import sys
 import tempfile
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import zenoh
 from rich.console import Console
 from rich.table import Table
 
 from palpate import clock
-from palpate.bus import Delivery, endpoints
-from palpate.bus.topics import (
-    ELECTRODES,
-    ENCODING_PREFIX,
-    FEATURES,
-    MAX_MESSAGE_BYTES,
-    STATUS,
-    sensor_key,
-)
-from palpate.bus.zenoh_session import open_zenoh
-from palpate.codec import ELECTRODE_FRAME, ERROR, TARE_REQUEST
-from palpate.config import LinkConfig
-from palpate.errors import ConfigError, ErrorCode, PalpateError, StaleError, StreamTimeout
-from palpate.messages import SensorState, ServiceRequest, ServiceState, TareRequest
+from palpate.bus import Delivery
+from palpate.bus.topics import ELECTRODES, FEATURES, STATUS
+from palpate.errors import ConfigError, PalpateError, StaleError, StreamTimeout
+from palpate.messages import SensorState, ServiceState
 from palpate_deploy.bench.fault_station import (
-    FORGED_TICK,
+    RECOVERY_S,
     SENSOR,
-    EstimateAccount,
     FaultStation,
+    Figures,
     resident_bytes,
+    seconds_until,
 )
 from palpate_deploy.bench.results import finish, progress_bar
+from palpate_deploy.bench.strangers import bad_sequences, hostile_payloads, query_flood
 
-Figures = dict[str, float | int | str]
 FAKETIME = (
     "/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1",
     "/usr/lib/aarch64-linux-gnu/faketime/libfaketime.so.1",
@@ -57,9 +45,6 @@ FAKETIME = (
 """Where Debian's package ``libfaketime`` puts its library."""
 
 LOST = SensorState.LOST
-
-_PATIENCE_S = 20.0
-_SEED = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,25 +79,6 @@ class _Untried(Exception):
     """This host cannot try a row."""
 
 
-def _shown(account: EstimateAccount, prefix: str = "") -> Figures:
-    return {
-        f"{prefix}estimates": account.received,
-        f"{prefix}lost": account.lost,
-        f"{prefix}p99_s": account.p99_s,
-        f"{prefix}longest_gap_s": account.longest_gap_s,
-    }
-
-
-def _until(true: Callable[[], bool], timeout_s: float = _PATIENCE_S) -> float:
-    """Time until something holds [s]; infinity if it does not in time."""
-    began_s = time.monotonic()
-    while not true():
-        if time.monotonic() - began_s > timeout_s:
-            return float("inf")
-        time.sleep(0.005)
-    return time.monotonic() - began_s
-
-
 def router_killed(seconds: float) -> tuple[bool, Figures]:
     """The router is gone for five seconds: links between processes go on, new ones resume."""
     with FaultStation() as station:
@@ -122,19 +88,19 @@ def router_killed(seconds: float) -> tuple[bool, Figures]:
         station.kill("router", signal.SIGKILL)
         time.sleep(5.0)
         station.start("router")
-        back_s = _until(station.observer.session.has_router)
+        back_s = seconds_until(station.observer.session.has_router)
         with station.fresh_session() as session:
 
             def all_there() -> bool:
                 return {one.service for one in session.alive() if one.ready} >= set(names)
 
-            found_s = back_s + _until(all_there)
+            found_s = back_s + seconds_until(all_there)
         station.observer.wait_for_next()
         station.check(*names)
         same = before == {name: station.pid(name) for name in names}
         account = station.observer.account(mark)
     met = found_s <= 2.0 and same and account.lost == 0
-    return met, {"resumed_s": back_s, "all_found_s": found_s, **_shown(account)}
+    return met, {"resumed_s": back_s, "all_found_s": found_s, **account.figures()}
 
 
 def subscriber_frozen(seconds: float) -> tuple[bool, Figures]:
@@ -208,11 +174,11 @@ def _disk_trial(
             quiet = station.observer.account(mark)
             mark = station.observer.mark()
             break_it(inside, pid)
-            told_s = _until(lambda: _state_said(says) is ServiceState.DEGRADED)
+            told_s = seconds_until(lambda: _state_said(says) is ServiceState.DEGRADED)
             time.sleep(seconds)
             broken = station.observer.account(mark)
             mend(inside, pid)
-            resumed_s = _until(lambda: _state_said(says) is ServiceState.READY)
+            resumed_s = seconds_until(lambda: _state_said(says) is ServiceState.READY)
             time.sleep(1.0)
             station.check("recorder", "features", "gateway")
             status = station.stop_one("recorder")
@@ -222,9 +188,9 @@ def _disk_trial(
         "resumed_s": resumed_s,
         "p99_ratio": ratio,
         "recorder_exit_status": status,
-        **_shown(broken),
+        **broken.figures(),
     }
-    return told_s <= 1.5 and resumed_s < _PATIENCE_S and broken.lost == 0 and status == 0, figures
+    return told_s <= 1.5 and resumed_s < RECOVERY_S and broken.lost == 0 and status == 0, figures
 
 
 def _state_said(says: Any) -> ServiceState | None:
@@ -293,46 +259,18 @@ def wall_clock_jumps(seconds: float) -> tuple[bool, Figures]:
             time.sleep(seconds)
             station.check("gateway", "features", "recorder")
             account = station.observer.account(mark)
-            counters = _counters(station, "gateway")
-            dropped = _refusals(station)
+            counters = station.counters("gateway")
+            dropped = station.refusals()
     steps = counters.get("wall_steps", 0)
     figures: Figures = {
         "wall_steps_told": steps,
         "refused": dropped,
         "youngest_s": account.youngest_s,
         "quiet_lost": quiet.lost,
-        **_shown(account),
+        **account.figures(),
     }
     sound = account.lost <= quiet.lost and account.disordered == 0 and account.youngest_s >= 0.0
     return sound and steps >= 3, figures
-
-
-def _counters(station: FaultStation, service: str) -> dict[str, int]:
-    status = station.observer.session.query(
-        endpoints.STATUS, ServiceRequest(), service=service, timeout_s=5.0
-    )
-    return dict(status.counters)
-
-
-def _refusals(station: FaultStation) -> str:
-    """What the features service has counted beside the good frames, for people."""
-    usual = ("frames_received", "estimates_published", "untared")
-    counters = _counters(station, "features")
-    return ", ".join(
-        f"{name} {count}" for name, count in sorted(counters.items()) if count and name not in usual
-    )
-
-
-@contextlib.contextmanager
-def _stranger(station: FaultStation) -> Iterator[zenoh.Session]:
-    """A session of another program, which keeps to no contract."""
-    link = LinkConfig(connect=station.profile.link.connect, wait_for_router_s=5.0)
-    session = open_zenoh(link, "peer")
-    try:
-        time.sleep(0.5)
-        yield session
-    finally:
-        session.close()
 
 
 def sensor_silent(seconds: float) -> tuple[bool, Figures]:
@@ -372,185 +310,6 @@ def sensor_silent(seconds: float) -> tuple[bool, Figures]:
     figures: Figures = {"told_lost_s": told_s, "stale_used": stale_used, "back_s": back_s}
     # A frame lasts 10 ms and is published after its last slot.
     return told_s <= 0.07 and not stale_used and back_s <= 1.0, figures
-
-
-def bad_sequences(seconds: float) -> tuple[bool, Figures]:
-    """Frames with wrong numbers or times are sent under the finger's name, among good ones."""
-    import dataclasses
-
-    with FaultStation() as station, _stranger(station) as stranger:
-        profile = station.profile
-        key = sensor_key(profile.station, SENSOR, ELECTRODES.name)
-        frames = station.observer.session.subscriber(
-            ELECTRODES, sensor=SENSOR, delivery=Delivery.QUEUE
-        )
-        good = frames.next(5.0).message
-        encoding = zenoh.Encoding(ELECTRODES.encoding)
-
-        def send(sequence: int, later_ns: int) -> None:
-            stamp = dataclasses.replace(
-                good.stamp,
-                sequence=max(good.stamp.sequence + sequence, 1),
-                device_tick=FORGED_TICK,
-                monotonic_ns=good.stamp.monotonic_ns + later_ns,
-                wall_ns=good.stamp.wall_ns + later_ns,
-            )
-            frame = dataclasses.replace(good, stamp=stamp)
-            stranger.put(key, ELECTRODE_FRAME.encode(frame), encoding=encoding)
-
-        mark = station.observer.mark()
-        sent: Counter[str] = Counter()
-        kinds: dict[str, tuple[int, int]] = {
-            "repeated": (0, 0),
-            "old": (-50, -500_000_000),
-            "jump": (900, 20_000_000),
-            "far_jump": (1 << 40, 20_000_000),
-            "future": (5, 3_600_000_000_000),
-            "past": (5, -3_600_000_000_000),
-        }
-        until_s = time.monotonic() + 6 * seconds
-        turn = 0
-        while time.monotonic() < until_s:
-            with contextlib.suppress(StreamTimeout):
-                while True:
-                    newest = frames.next(0.0).message
-                    if newest.stamp.device_tick != FORGED_TICK:
-                        good = newest
-            kind = list(kinds)[turn % len(kinds)]
-            send(*kinds[kind])
-            sent[kind] += 1
-            turn += 1
-            time.sleep(0.113)
-        account = station.observer.account(mark)
-        refused = _refusals(station)
-    figures: Figures = {
-        "bad_sent": sum(sent.values()),
-        "refused": refused,
-        "forged": account.forged,
-        "disordered": account.disordered,
-        **_shown(account),
-    }
-    return account.lost <= sum(sent.values()) and account.forged == 0, figures
-
-
-def hostile_payloads(seconds: float) -> tuple[bool, Figures]:
-    """Random, mutated, oversize and mislabelled payloads are sent to the features service."""
-    rng = random.Random(_SEED)
-    per_s = 2000
-    with FaultStation() as station, _stranger(station) as stranger:
-        key = sensor_key(station.profile.station, SENSOR, ELECTRODES.name)
-        frames = station.observer.session.subscriber(ELECTRODES, sensor=SENSOR)
-        whole = frames.next(5.0).payload
-        frames.close()
-        right = zenoh.Encoding(ELECTRODES.encoding)
-        mark = station.observer.mark()
-        time.sleep(seconds)
-        quiet = station.observer.account(mark)
-        before = _counters(station, "features")
-        resident = resident_bytes(station.pid("features"))
-        mark = station.observer.mark()
-        sent, due_s = 0, time.monotonic()
-        for _ in range(int(3 * seconds * per_s)):
-            kind = rng.random()
-            encoding = right
-            if kind < 0.5:
-                payload = rng.randbytes(rng.randrange(400))
-            elif kind < 0.9:
-                # Cut off: every such prefix lacks what the contract requires.
-                payload = whole[: rng.randrange(len(whole) // 2)]
-            elif kind < 0.999:
-                payload, encoding = whole, zenoh.Encoding(ENCODING_PREFIX + "palpate.v9.Frame")
-            else:
-                payload = bytes(MAX_MESSAGE_BYTES // 8)
-            stranger.put(key, payload, encoding=encoding)
-            sent += 1
-            due_s += 1.0 / per_s
-            if (left_s := due_s - time.monotonic()) > 0.0:
-                time.sleep(left_s)
-        time.sleep(1.5)
-        account = station.observer.account(mark)
-        after = _counters(station, "features")
-        grew = resident_bytes(station.pid("features")) - resident
-        station.check("gateway", "features", "recorder")
-    told = sum(
-        after.get(name, 0) - before.get(name, 0)
-        for name in after
-        if name.startswith("rejected") or name.startswith("dropped")
-    )
-    figures: Figures = {
-        "sent": sent,
-        "rejected_or_dropped": told,
-        "p99_ratio": account.p99_s / quiet.p99_s,
-        "features_grew_bytes": grew,
-        **_shown(account),
-    }
-    return account.lost <= 0.01 * account.received and grew < 16 << 20, figures
-
-
-def reply_code(reply: zenoh.Reply) -> str:
-    """``answered``, the code of a typed error, ``timeout``, or ``untyped``."""
-    if reply.err is None:
-        return "answered"
-    content = reply.err.payload.to_bytes()
-    if str(reply.err.encoding) == ENCODING_PREFIX + ERROR.schema:
-        return ERROR.decode(content).code.name.lower()
-    return "timeout" if content == b"Timeout" else "untyped"
-
-
-def query_flood(seconds: float) -> tuple[bool, Figures]:
-    """A hundred times more questions than the gateway can hold: refused, typed, and soon over."""
-    many = 1600
-    codes: Counter[str] = Counter()
-    with FaultStation() as station, _stranger(station) as stranger:
-        mark = station.observer.mark()
-        time.sleep(seconds)
-        quiet = station.observer.account(mark)
-        tare = station.observer.session.query(
-            endpoints.TARE, TareRequest(), sensor=SENSOR, timeout_s=10.0
-        )
-        key = sensor_key(station.profile.station, SENSOR, endpoints.TARE.name)
-        payload = TARE_REQUEST.encode(TareRequest())
-        encoding = zenoh.Encoding(ENCODING_PREFIX + TARE_REQUEST.schema)
-        ended = threading.Semaphore(0)
-        lock = threading.Lock()
-
-        def note(reply: zenoh.Reply) -> None:
-            with lock:
-                codes[reply_code(reply)] += 1
-
-        mark = station.observer.mark()
-        for _ in range(many):
-            stranger.get(
-                key,
-                zenoh.handlers.Callback(note, ended.release),
-                payload=payload,
-                encoding=encoding,
-                timeout=30.0,
-            )
-        for _ in range(many):
-            ended.acquire(timeout=60.0)
-        account = station.observer.account(mark)
-
-        def answers() -> bool:
-            try:
-                station.observer.session.query(
-                    endpoints.TARE, TareRequest(tare_id=tare.tare_id), sensor=SENSOR, timeout_s=0.5
-                )
-            except PalpateError:
-                return False
-            return True
-
-        again_s = _until(answers)
-    figures: Figures = {
-        "asked": many,
-        **{f"{name}_replies": count for name, count in sorted(codes.items())},
-        "answers_again_s": again_s,
-        "p99_ratio": account.p99_s / quiet.p99_s,
-        **_shown(account),
-    }
-    refused = codes[ErrorCode.RESOURCE_EXHAUSTED.name.lower()]
-    silent = many - sum(codes.values()) + codes["untyped"] + codes["timeout"]
-    return silent == 0 and refused > 0 and again_s <= 1.0 and account.lost == 0, figures
 
 
 TRIALS = tuple(

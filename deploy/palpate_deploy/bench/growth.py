@@ -173,11 +173,11 @@ def slope_of(
     return slope, _TWO_SIDED_95 * error
 
 
-def verdict_of(slope: float, half: float, limit: float = LIMIT_MB_PER_H) -> Verdict:
+def verdict_of(slope: float, half: float) -> Verdict:
     """Whether a slope is below the limit, above it, or not known well enough."""
-    if slope + half < limit:
+    if slope + half < LIMIT_MB_PER_H:
         return Verdict.STEADY
-    return Verdict.GROWS if slope - half > limit else Verdict.UNDECIDED
+    return Verdict.GROWS if slope - half > LIMIT_MB_PER_H else Verdict.UNDECIDED
 
 
 def growths(histories: Mapping[str, History], since_s: float) -> dict[str, Growth]:

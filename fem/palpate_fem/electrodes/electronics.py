@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.anatomy import ELECTRODE_POSITIONS
+from palpate.anatomy import spatial_modes
 from palpate_fem.electrodes.specimen import SENSING, SpecimenParameters
 
 Floats = NDArray[np.float64]
@@ -77,16 +77,6 @@ def core_temperature_c(since_on_s: float, ambient_c: float, specimen: SpecimenPa
 def log_sigma(temperature_c: float, specimen: SpecimenParameters) -> float:
     """Logarithm of the conductivity over its value at the reference temperature."""
     return specimen.temperature_coefficient * (temperature_c - specimen.reference_c)
-
-
-def spatial_modes() -> Floats:
-    """Two smooth modes over the electrodes, shape (2, 19): along the finger, and to the sides.
-
-    Both have zero mean and unit mean square, so `gradient_sd` is the deviation of one electrode.
-    """
-    raw = np.stack([ELECTRODE_POSITIONS[:, 0], np.abs(ELECTRODE_POSITIONS[:, 1])])
-    raw = raw - raw.mean(axis=1, keepdims=True)
-    return np.asarray(raw / raw.std(axis=1, keepdims=True))
 
 
 FRAME_S = 10e-3
@@ -198,27 +188,3 @@ def _followed(goal: Floats, ways: Floats, start: Floats) -> Floats:
 
 PDC_PA = 36.5
 """Pressure of one count of PDC [Pa]."""
-
-PAC_PA = 0.37
-"""Pressure of one count of PAC [Pa]."""
-
-KELVIN = 273.15
-# A thermistor of 0.6444 exp(4025 / T) Ohm against 30 kOhm; the maker states the result in this
-# form.
-BETA_K, UPPER, LOWER = 4025.0, 155183.0, 46555.0
-
-
-def pressure_of_pdc(counts: Floats, specimen: SpecimenParameters) -> Floats:
-    """Fluid pressure above ambient [Pa] for PDC [counts], any shape."""
-    return np.asarray((np.asarray(counts, np.float64) - specimen.pdc_offset) * PDC_PA)
-
-
-def pressure_of_pac(counts: Floats, specimen: SpecimenParameters) -> Floats:
-    """Vibration of the fluid pressure above 10 Hz [Pa] for PAC [counts], any shape."""
-    return np.asarray((np.asarray(counts, np.float64) - specimen.pac_offset) * PAC_PA)
-
-
-def temperature_of_tdc(counts: Floats) -> Floats:
-    """Core temperature [degrees C] for TDC [counts] in 1..4095, any shape."""
-    x = np.asarray(counts, np.float64) / FULL_SCALE
-    return np.asarray(BETA_K / np.log((UPPER - LOWER * x) / x) - KELVIN)

@@ -18,9 +18,6 @@ from palpate.messages import COUNTS_MAX, SensorType
 from palpate.ros.layouts import BIOTAC_ALL, BIOTAC_HAND, Dialect, decode, time_of
 from palpate_gateway.protocols.channels import SLOT_RATE_HZ
 
-FINGERS = ("first", "middle", "ring", "little", "thumb")
-"""Order of the fingers in a ``BiotacAll``."""
-
 _FRAME_S_MAX = 1.0
 _SLOT_S = (1e-5, 1e-2)
 """Slot periods outside of these are no measurement [s]."""

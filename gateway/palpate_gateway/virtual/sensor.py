@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from palpate.anatomy import ELECTRODE_POSITIONS
+from palpate.anatomy import spatial_modes
 from palpate.files.tape import TapeSpecimen
 from palpate.messages import COUNTS_MAX, PAC_SAMPLES, CountArray
 from palpate_gateway.virtual.model import Array, SampledFrames
@@ -71,7 +71,7 @@ class TwinSensor:
         self._random = np.random.default_rng([seed, 2])
         self._rest = unit.rest_counts.astype(np.float64)
         sizes = self._random.standard_normal(2) * (unit.gradient_sd / math.sqrt(2.0))
-        self._modes: Array = sizes @ _spatial_modes()
+        self._modes: Array = sizes @ spatial_modes()
         self._creep: Array = np.zeros_like(self._rest)
         self._creep_kept = math.exp(-1.0 / (rate_hz * unit.creep_tau_s))
         self._vibration_pa = 0.0
@@ -159,13 +159,3 @@ class TwinSensor:
             )
         moving = steady[:, None] + (at_start - steady)[:, None] * self._pac_kept[:-1]
         return self._unit.pac_offset + moving / PAC_PA_PER_COUNT
-
-
-def _spatial_modes() -> Array:
-    """Two smooth modes over the electrodes, along the finger and to the sides, shape ``(2, 19)``.
-
-    They have zero mean and unit mean square, so ``gradient_sd`` is the deviation of an electrode.
-    """
-    raw = np.stack([ELECTRODE_POSITIONS[:, 0], np.abs(ELECTRODE_POSITIONS[:, 1])])
-    raw = raw - raw.mean(axis=1, keepdims=True)
-    return np.asarray(raw / raw.std(axis=1, keepdims=True))

@@ -1,9 +1,10 @@
-"""Writing files atomically: a file appears complete or not at all."""
+"""Writing files and folders atomically: one appears complete or not at all."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +15,8 @@ from palpate.errors import DatasetError, PalpateError
 def written_whole(path: Path) -> Iterator[Path]:
     """A temporary path beside a file; renamed to the file when the block ends without an error.
 
-    The file's folder is made. A file that is there stays until then.
+    The file's folder is made. A file that is there stays until then. The block may make a folder
+    at the temporary path, if nothing is at its place.
 
     Raises:
         DatasetError: The disk is full, or the folder cannot be written.
@@ -32,4 +34,7 @@ def written_whole(path: Path) -> Iterator[Path]:
         ) from error
     finally:
         with contextlib.suppress(OSError):  # its folder may be what could not be made
-            partial.unlink(missing_ok=True)
+            if partial.is_dir():
+                shutil.rmtree(partial)
+            else:
+                partial.unlink(missing_ok=True)

@@ -121,11 +121,6 @@ def typestore(dialect: Dialect) -> Any:
     return store
 
 
-def md5_sum(layout: str) -> str:
-    """MD5 sum of a layout as ROS 1 computes it."""
-    return str(typestore("ros1").generate_msgdef(layout)[1])
-
-
 def type_hash(layout: str) -> str:
     """Hash of a layout as ROS 2 computes it, e.g. ``"RIHS01_8dc3..."``; it stands in keys."""
     return str(typestore("cdr").hash_rihs01(layout))

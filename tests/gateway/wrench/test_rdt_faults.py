@@ -4,41 +4,18 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.gateway.rdt_sensors import device_at, running
 from tests.gateway.reading_devices import open_again
 
-from palpate.config import parse_config
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate.messages import ServiceState
-from palpate_gateway.emulators.emulator import Wrench
 from palpate_gateway.emulators.rdt import RdtEmulator, page
-from palpate_gateway.wrench.rdt import RdtOptions, WrenchRdt
 
 fakes: Any = importlib.import_module("wrench_fakes")
-PRODUCTS = {"ati_net_ft": "netft", "ati_axia": "axia", "schunk_ftn": "axia", "onrobot_hex": "hex"}
-
-
-def device_at(emulator: RdtEmulator, product: str = "ati_net_ft", **options: Any) -> WrenchRdt:
-    host, _, port = emulator.address.partition(":")
-    values = {"product": product, "host": host, "port": int(port), **options}
-    values.setdefault("http_port", emulator.page.port)
-    return WrenchRdt(parse_config(RdtOptions, values, where="test"))
-
-
-@contextmanager
-def running(
-    product: str = "ati_net_ft", source: Callable[[float], Wrench] = fakes.wave, **options: Any
-) -> Iterator[tuple[RdtEmulator, WrenchRdt]]:
-    with (
-        RdtEmulator(PRODUCTS[product], source) as emulator,
-        device_at(emulator, product, **options) as device,
-    ):
-        yield emulator, device
 
 
 def test_a_start_that_is_not_heard_is_repeated() -> None:

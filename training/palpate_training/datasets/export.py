@@ -5,11 +5,8 @@ The experiment's rows as rows of features, for ``palpate train features``.
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import os
 import re
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import DatasetError
+from palpate.files.atomic import written_whole
 from palpate.files.hdf5 import new_file
 from palpate.messages import COUNTS_MAX
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
@@ -123,21 +121,8 @@ def written_new(path: Path, write: Callable[[Path], None]) -> None:
     """
     if path.exists():
         raise DatasetError(f"{path} exists", remedy="remove it, or give another name")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as partial:
         write(partial)
-        os.replace(partial, path)
-    except OSError as error:
-        raise DatasetError(
-            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):  # gone, if it was moved
-            if partial.is_dir():
-                shutil.rmtree(partial)
-            else:
-                partial.unlink()
 
 
 def _write_unit(path: Path, rows: ExperimentDataset, trials: Any) -> None:

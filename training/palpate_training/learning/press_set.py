@@ -23,9 +23,6 @@ FloatArray = npt.NDArray[np.float32]
 INPUTS = ELECTRODES
 """Changes of the logarithms of the impedance since rest."""
 
-PRESS_COLUMNS = INPUTS + 4
-"""Of a row of a press: inputs, force [N], its share of the press: one over its rows, 0 = none."""
-
 
 @dataclass(frozen=True, slots=True)
 class CalibrationPresses:
