@@ -75,8 +75,9 @@ def _latency() -> str:
             )
         )
     text = (
-        "The *floor* is the same path without palpate's code. Both run in turns of a few seconds, "
-        "so that they meet the same disturbances of the host.\n\n"
+        "The *floor* is the same path without palpate's code, and runs the same network: that of "
+        f"`{values.get('e2e.bundle', 'features-virtual')}`, which is small. Both run in turns of a "
+        "few seconds, so that they meet the same disturbances of the host.\n\n"
     )
     text += _table(
         "frame stamp to estimate in the client, medians of runs | p50 | p99 | max of all runs "
@@ -101,6 +102,7 @@ def _latency() -> str:
             if (load := values.get(f"load.{name}"))
         ),
     )
+    text += _of_twin()
     slow = _read("e2e-slow-host")
     load = slow["load.features"]
     text += (
@@ -116,6 +118,23 @@ def _latency() -> str:
     )
     command = f"palpate bench e2e --runs {len(values['e2e.runs'])}"
     return _section("Latency beside a bare floor", command, values, text)
+
+
+def _of_twin() -> str:
+    """The same with the largest network that ships."""
+    values = _read("e2e-twin")
+    ours, floor, stages = (values[f"e2e.{name}"] for name in ("palpate", "floor", "stages_s"))
+    load, machine = values["load.features"], values["machine"]
+    return (
+        f"\n**A larger network.** `{values['e2e.bundle']}`, which the profile `virtual` serves, "
+        "has weights of 11 MB, which the processor has to fetch for each frame. "
+        f"`palpate bench e2e --bundle features-twin --runs {len(values['e2e.runs'])}` "
+        f"({machine['cpus']} cores, {machine['cpu']}): p50 {_ms(ours['p50_s'])} and p99 "
+        f"{_ms(ours['p99_s'])}, the floor {_ms(floor['p50_s'])} and {_ms(floor['p99_s'])}, ratios "
+        f"{values['e2e.p50_ratio']:.2f} and {values['e2e.p99_ratio']:.2f}; inference "
+        f"{_ms(stages['infer'])}. Of {load['sensors']} fingers {load['lost']:,} of "
+        f"{load['published']:,} frames were lost: two cores are too few for so many with it.\n"
+    )
 
 
 def _compared(values: dict[str, Any], commit: str) -> str:

@@ -44,6 +44,7 @@ def test_e2e_reports_both_sides_and_the_load(palpate: Palpate, bundle: str) -> N
         assert 20 < numbers["count"] < 250
         assert 0 < numbers["p50_s"] <= numbers["p99_s"] <= numbers["max_s"]
     assert values["e2e.p50_ratio"] > 0
+    assert values["e2e.bundle"].startswith("features-virtual:")
     for service, fingers in (("features", 3), ("field", 1)):
         load = values[f"load.{service}"]
         assert load["published"] >= 200 * fingers

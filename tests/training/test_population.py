@@ -219,7 +219,7 @@ def test_where_fingertips_differ_some_are_never_met() -> None:
     one = replace(
         population(),
         electrodes=np.zeros((len(group), 19), np.uint16),
-        baseline=np.zeros((len(group), 19), np.float32),
+        baseline=np.full((len(group), 19), 2000.0, np.float32),
         force=force.astype(np.float32),
         group=group.astype(np.int32),
         block=group.astype(np.int32),

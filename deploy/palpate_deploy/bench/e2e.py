@@ -22,6 +22,7 @@ from rich.table import Table
 
 from palpate.config import LinkConfig
 from palpate.errors import LinkError
+from palpate.files.bundle import read_manifest
 from palpate_deploy.bench.harness import SourceGate, read_rows
 from palpate_deploy.bench.load import LoadResult, ramp_rate, run_load, start_palpate
 from palpate_deploy.bench.results import Latency, finish, latency, progress_bar, stage_medians
@@ -85,6 +86,8 @@ def run_e2e(
 ) -> None:
     """``palpate bench e2e``, whose help explains the options: measure, print, keep."""
     folder = Repository.of_user().resolve(bundle)
+    manifest = read_manifest(folder)
+    label = f"{manifest.name}:{manifest.version}"
     measured: list[Run] = []
     loads: list[LoadResult] = []
     first_loss: LoadResult | None = None
@@ -113,8 +116,8 @@ def run_e2e(
             first_loss = ramp_rate(loads[0], bundle=bundle, bar=bar)
     finish(
         "e2e",
-        _values(measured, loads, first_loss),
-        lambda: _print(measured, loads, first_loss, ramped=ramp and bool(sensors)),
+        {"e2e.bundle": label} | _values(measured, loads, first_loss),
+        lambda: _print(label, measured, loads, first_loss, ramped=ramp and bool(sensors)),
         as_json=as_json,
         save=save,
         out=out,
@@ -235,11 +238,17 @@ def _median(runs: list[Run], side: str) -> dict[str, float]:
 
 
 def _print(
-    runs: list[Run], loads: list[LoadResult], first_loss: LoadResult | None, *, ramped: bool
+    label: str,
+    runs: list[Run],
+    loads: list[LoadResult],
+    first_loss: LoadResult | None,
+    *,
+    ramped: bool,
 ) -> None:
     console = Console(highlight=False)
     table = Table(
-        title=f"frame stamp to estimate in the client, one finger at {RATE_HZ:g} Hz, loopback TCP",
+        title=f"frame stamp to estimate of {label} in the client, one finger at {RATE_HZ:g} Hz, "
+        "loopback TCP",
         title_justify="left",
     )
     for column in ("", "p50", "p99", "max", "estimates", "lost"):

@@ -323,13 +323,6 @@ class ServedModels:
         """
         folder = self._repository.resolve(source)
         bundle = self._repository.read(folder)
-        label = f"{bundle.manifest.name}:{bundle.manifest.version}"
-        by_path = "/" in source or source.startswith(".")
-        if not by_path and label != f"{folder.parent.name}:{folder.name}":
-            raise BundleError(
-                f"{folder} holds the bundle {label}",
-                remedy="bundles stand in <name>/<version>: palpate model import FOLDER",
-            )
         loaded = self._loaded()
         runtime = loaded.get(bundle.sha256)
         if runtime is None:
@@ -338,6 +331,8 @@ class ServedModels:
             if bundle.sha256 != tried:
                 bundle = proven(bundle, self._task)
             runtime = load(bundle, self._task)
+        by_path = "/" in source or source.startswith(".")
+        label = f"{bundle.manifest.name}:{bundle.manifest.version}"
         return Choice(str(folder.absolute()) if by_path else label, bundle.sha256, runtime)
 
     def _again(self, choice: Choice) -> Choice:
