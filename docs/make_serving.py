@@ -124,16 +124,18 @@ def _of_twin() -> str:
     """The same with the largest network that ships."""
     values = _read("e2e-twin")
     ours, floor, stages = (values[f"e2e.{name}"] for name in ("palpate", "floor", "stages_s"))
-    load, machine = values["load.features"], values["machine"]
+    load, machine, small = (values[key] for key in ("load.features", "machine", "e2e.compared"))
     return (
         f"\n**A larger network.** `{values['e2e.bundle']}`, which the profile `virtual` serves, "
         "has weights of 11 MB, which the processor has to fetch for each frame. "
-        f"`palpate bench e2e --bundle features-twin --runs {len(values['e2e.runs'])}` "
-        f"({machine['cpus']} cores, {machine['cpu']}): p50 {_ms(ours['p50_s'])} and p99 "
+        f"`palpate bench e2e --bundle features-twin --runs {len(values['e2e.runs'])}` on a slower "
+        f"host ({machine['cpus']} cores, {machine['cpu']}): p50 {_ms(ours['p50_s'])} and p99 "
         f"{_ms(ours['p99_s'])}, the floor {_ms(floor['p50_s'])} and {_ms(floor['p99_s'])}, ratios "
         f"{values['e2e.p50_ratio']:.2f} and {values['e2e.p99_ratio']:.2f}; inference "
-        f"{_ms(stages['infer'])}. Of {load['sensors']} fingers {load['lost']:,} of "
-        f"{load['published']:,} frames were lost: two cores are too few for so many with it.\n"
+        f"{_ms(stages['infer'])}; of {load['sensors']} fingers {load['lost']:,} of "
+        f"{load['published']:,} frames were lost. With `{small['bundle']}` there: p50 "
+        f"{_ms(small['p50_s'])}, the floor {_ms(small['floor_p50_s'])}, inference "
+        f"{_ms(small['infer_s'])}, {small['lost']:,} frames lost (`{small['command']}`).\n"
     )
 
 
