@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -87,19 +85,12 @@ def test_a_record_with_nothing_to_show_is_named(make_frame: Frames, tmp_path: Pa
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk_is_told(record: Path, tmp_path: Path) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(disk)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip("mounting a small disk needs root")
-    try:
-        with pytest.raises(RecordingError, match=r"view\.rrd: Rerun cannot write") as caught:
-            review(record, disk / "view.rrd")
-        assert "free space" in caught.value.remedy
-        assert list(disk.iterdir()) == []
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
+def test_a_full_disk_is_told(record: Path, small_disk: Callable[[str], Path]) -> None:
+    disk = small_disk("300k")
+    with pytest.raises(RecordingError, match=r"view\.rrd: Rerun cannot write") as caught:
+        review(record, disk / "view.rrd")
+    assert "free space" in caught.value.remedy
+    assert list(disk.iterdir()) == []
 
 
 @pytest.mark.parametrize("content", [b"", b"%PDF-1.4\n" * 300, b"\x89MCAP"])

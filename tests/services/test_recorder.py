@@ -198,53 +198,46 @@ def test_disk_that_fills_up_while_recording(
     station: Station,
     make_frame: Frames,
     make_tare: Callable[..., Tare],
-    tmp_path: Path,
+    small_disk: Callable[[str], Path],
     until: Until,
 ) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip("mounting a small disk needs root")
-    try:
-        with station(out=disk / "runs", rrd=False, min_free_bytes=0) as session:
-            answers = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
-            announce(session, make_tare())
-            frames = session.publisher(ELECTRODES, sensor="finger")
+    disk = small_disk("3m")
+    with station(out=disk / "runs", rrd=False, min_free_bytes=0) as session:
+        answers = session.subscriber(FEATURES, delivery=Delivery.QUEUE)
+        announce(session, make_tare())
+        frames = session.publisher(ELECTRODES, sensor="finger")
 
-            def answered(first: int, last: int) -> None:
-                for sequence in range(first, last):
-                    frames.put(make_frame(sequence))
-                    assert answers.next(5.0).message.source.sequence == sequence
+        def answered(first: int, last: int) -> None:
+            for sequence in range(first, last):
+                frames.put(make_frame(sequence))
+                assert answers.next(5.0).message.source.sequence == sequence
 
-            answered(1, 20)
-            # Wait until they are on the disk: what a full disk cuts off is counted, not kept.
-            runs = disk / "runs"
-            until(lambda: status_of(session, "recorder").counters.get("recorded_features", 0) >= 19)
-            time.sleep(0.5)  # several flushes
-            ballast = disk / "ballast"
-            with open(ballast, "wb", buffering=0) as file:
-                try:
-                    while True:
-                        file.write(bytes(1024))
-                except OSError:
-                    pass
-            answered(20, 70)
-            until(lambda: status_of(session, "recorder").state is ServiceState.DEGRADED)
-            error = status_of(session, "recorder").last_error
-            assert error is not None
-            assert error.code is ErrorCode.DISK
-            answered(70, 90)
-            ballast.unlink()
-            until(lambda: status_of(session, "recorder").state is ServiceState.READY)
-            answered(90, 120)
-            until(lambda: status_of(session, "recorder").counters.get("recorded_features", 0) > 40)
-            # What the full disk cut off is saved by a thread of its own.
-            until(lambda: any(runs.glob("*.recovered.mcap")))
-        kept = payloads(disk / "runs", "electrodes")
-        assert len(kept) >= 40
-    finally:
-        subprocess.run(["umount", "-l", str(disk)], check=True, capture_output=True)
+        answered(1, 20)
+        # Wait until they are on the disk: what a full disk cuts off is counted, not kept.
+        runs = disk / "runs"
+        until(lambda: status_of(session, "recorder").counters.get("recorded_features", 0) >= 19)
+        time.sleep(0.5)  # several flushes
+        ballast = disk / "ballast"
+        with open(ballast, "wb", buffering=0) as file:
+            try:
+                while True:
+                    file.write(bytes(1024))
+            except OSError:
+                pass
+        answered(20, 70)
+        until(lambda: status_of(session, "recorder").state is ServiceState.DEGRADED)
+        error = status_of(session, "recorder").last_error
+        assert error is not None
+        assert error.code is ErrorCode.DISK
+        answered(70, 90)
+        ballast.unlink()
+        until(lambda: status_of(session, "recorder").state is ServiceState.READY)
+        answered(90, 120)
+        until(lambda: status_of(session, "recorder").counters.get("recorded_features", 0) > 40)
+        # What the full disk cut off is saved by a thread of its own.
+        until(lambda: any(runs.glob("*.recovered.mcap")))
+    kept = payloads(disk / "runs", "electrodes")
+    assert len(kept) >= 40
 
 
 def test_unknown_topic_is_named() -> None:
