@@ -98,21 +98,6 @@ def table_of(found: list[dict[str, Any]]) -> str:
     return markdown_table(heads, rows, words=3)
 
 
-def not_measured(found: dict[str, list[dict[str, Any]]]) -> str:
-    """A note on cells of the rivals that the JSON file does not hold yet."""
-    missing = any(
-        figure["name"] == "force_magnitude" and None in (figure["constant"], figure["zero"])
-        for errors in found.values()
-        for one in errors
-        for figure in one["figures"]
-    )
-    return (
-        "\nThe constant and the zero of features came after this run: what it lacks is left empty."
-        if missing
-        else ""
-    )
-
-
 def page(found: dict[str, list[dict[str, Any]]]) -> str:
     """The page."""
     tables = "\n".join(
@@ -144,7 +129,7 @@ The bounds of the first two bundles were learned from `calibrate`, `check` and
 three sets have other registration errors than those of the training; the errors of the location
 include this difference. The errors of each bundle on presses that its own training held out are on
 [its card](../models.md).
-[How they were trained](../twin.md#networks).{not_measured(found)}
+[How they were trained](../twin.md#networks).
 
 {tables}"""
 

@@ -32,6 +32,9 @@ REPEATED = 0.0 if DEVICE == "cpu" else 1e-9
 
 ROUNDING = 1e-12 if DEVICE == "cpu" else 1e-10
 
+TANGENT_ROUNDING = 1e-12 if DEVICE == "cpu" else 1e-6
+"""A GPU keeps what elements give to a tangent in single precision."""
+
 SLOTS = 5
 PLACES = (3, 0, 4)  # of the cases; slots 1 and 2 stay as they are
 BYSTANDERS = (1, 2)
