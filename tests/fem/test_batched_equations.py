@@ -468,7 +468,7 @@ def test_contact_without_mortar_and_without_a_core(
     tangent = wp.zeros((2, len(values)), dtype=wp.float64, device=DEVICE)
     none = wp.zeros(2, dtype=wp.float64, device=DEVICE)
     equations.tangent(batched, listed, tangent, elastic=listed, viscosity=none)
-    same(tangent.numpy()[1], values)
+    same(tangent.numpy()[1], values, TANGENT_ROUNDING)
     vectors = wp.zeros((2, 1, equations.size), dtype=wp.float64, device=DEVICE)
     equations.coupled(batched, listed, vectors, 0)
     assert np.abs(load).max() > 0.0
