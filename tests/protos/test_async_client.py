@@ -136,6 +136,42 @@ def test_an_async_stream_tells_of_another_sensor_though_its_task_is_slow(
     asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
 
 
+def test_a_stream_whose_first_reader_gives_up_is_opened_once(
+    link: LinkConfig, finger: Finger, wait_until: WaitUntil
+) -> None:
+    def threads() -> list[threading.Thread]:
+        return [one for one in threading.enumerate() if one.name == "palpate callback"]
+
+    async def scene() -> None:
+        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
+            stream = robot.stream_features("finger", max_age_s=LIVE_S, depth=50)
+            for _ in range(3):
+                reading = asyncio.create_task(anext(stream))
+                await asyncio.sleep(0)
+                reading.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await reading
+            together = await asyncio.gather(anext(stream), anext(stream))
+            sequences = [estimate.source.sequence for estimate in together]
+            async for estimate in stream:
+                sequences.append(estimate.source.sequence)
+                if len(sequences) == 50:
+                    break
+            assert sequences == sorted(set(sequences)), "each comes once"
+            assert len(threads()) == 1
+            # One that is closed before it is open leaves nothing behind.
+            late = robot.stream_features("finger", max_age_s=LIVE_S)
+            reading = asyncio.create_task(anext(late))
+            await asyncio.sleep(0)
+            await late.aclose()
+            with pytest.raises(StopAsyncIteration):
+                await reading
+            await stream.aclose()
+            await asyncio.to_thread(wait_until, lambda: not threads(), timeout_s=LIVE_S)
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
 async def _begun(
     ask: Callable[[], Coroutine[Any, Any, object]], begun: threading.Event
 ) -> asyncio.Task[object]:

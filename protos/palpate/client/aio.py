@@ -47,6 +47,7 @@ class AsyncStream(Generic[M]):
         self._changed: SensorChanged | None = None
         self._skipped = 0
         self._watch: Watch[M] | None = None
+        self._opening: asyncio.Task[None] | None = None
         self._closed = False
 
     @property
@@ -67,7 +68,7 @@ class AsyncStream(Generic[M]):
         """The next message; see ``Stream.__next__``."""
         check_process()
         if self._watch is None and not self._closed:
-            await self._open()
+            await self._opened()
         item: M | PalpateError
         while not self._closed:
             with self._lock:
@@ -84,6 +85,12 @@ class AsyncStream(Generic[M]):
         if isinstance(item, PalpateError):
             raise item
         return item
+
+    async def _opened(self) -> None:
+        """Wait until it is open. Whoever waits may be cancelled: the opening goes on, once."""
+        if self._opening is None or self._opening.done():
+            self._opening = asyncio.create_task(self._open())
+        await asyncio.shield(self._opening)
 
     async def _open(self) -> None:
         def watch() -> Watch[M]:
@@ -117,6 +124,8 @@ class AsyncStream(Generic[M]):
         self._arrived.set()
         if self._watch is not None:
             await self._client.in_thread(self._watch.close)
+        elif self._opening is not None:
+            await asyncio.wait({self._opening})  # it closes what it opens
 
     async def __aenter__(self) -> Self:
         return self
