@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -47,6 +48,7 @@ from palpate_training.experiment.generate.pipeline import (
     TRIALS,
     GeneratedExperiment,
     generate,
+    keep_spec,
     provenance_sha256,
 )
 from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
@@ -489,9 +491,32 @@ def test_a_damaged_spec_is_named(tmp_path: Path) -> None:
     (tmp_path / SPEC_FILE).write_text("{", encoding="utf-8")
     with pytest.raises(ConfigError, match=SPEC_FILE):
         generate(tmp_path, SPEC, specimens(), FemSimulator(), workers=1)
+    (tmp_path / SPEC_FILE).write_text("[]", encoding="utf-8")
+    with pytest.raises(ConfigError, match="no settings"):
+        generate(tmp_path, SPEC, specimens(), FemSimulator(), workers=1)
     (tmp_path / SPEC_FILE).write_text(json.dumps({"schema": "other"}), encoding="utf-8")
     with pytest.raises(ConfigError, match="another experiment"):
         generate(tmp_path, SPEC, specimens(), FemSimulator(), workers=1)
+
+
+def test_a_full_disk_is_not_called_a_damaged_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half(file: Path, *_: object, **__: object) -> None:
+        file.write_bytes(b"{")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    folder = tmp_path / "g"
+    with monkeypatch.context() as full:
+        full.setattr(Path, "write_text", half)
+        with pytest.raises(DatasetError, match=r"experiment\.json.*No space left") as caught:
+            keep_spec(folder, SPEC, specimens())
+    assert "damaged" not in caught.value.remedy
+    assert not list(folder.iterdir())
+    keep_spec(folder, SPEC, specimens())
+    keep_spec(folder, SPEC, specimens())
+    with pytest.raises(ConfigError, match="seed 1 is not 0"):
+        keep_spec(folder, replace(SPEC, seed=1), specimens())
 
 
 def test_processes_answer_every_task_and_hand_errors_on() -> None:
