@@ -32,6 +32,7 @@ from palpate_fem.cli.run import telling_step
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import COLUMNS
+from palpate_fem.result import IndentationOutcome
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter
 from palpate_fem.study import PathRow
@@ -262,6 +263,22 @@ def test_a_store_keeps_stress_of_all_or_of_none(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="with stress"):
         fem("run", "--steps", 4, "--store", with_stress)
     assert fem("run", "--steps", 4, "--store", with_stress, "--stress").exit_code == 0
+
+
+def test_stress_is_not_mixed_with_what_ran_out_of_time_without(tmp_path: Path) -> None:
+    store = tmp_path / "a.sim"
+    assert fem("run", "--steps", 5, "--store", store).exit_code == 0
+    held = SimulationStore.open(store)
+    (name,) = held.ids()
+    whole = held.trajectory(name)
+    held.file_of(name).unlink()
+    with StoreWriter(store, held.fingertip()) as writer:
+        late = replace(whole, steps=whole.steps[:2], outcome=IndentationOutcome.DEADLINE)
+        writer.write(name, late)
+    with pytest.raises(DatasetError, match="without stress"):
+        fem("run", "--steps", 3, "--store", store, "--stress")
+    # The one that is there is run again, so it may have stress then.
+    assert fem("run", "--steps", 5, "--store", store, "--stress").exit_code == 0
 
 
 @pytest.mark.parametrize(
