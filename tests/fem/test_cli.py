@@ -212,8 +212,8 @@ def test_one_press_that_another_process_runs_is_told(tmp_path: Path) -> None:
 def test_json_of_a_sweep_has_a_line_for_each_trajectory_that_the_store_holds(
     tmp_path: Path,
 ) -> None:
-    words = ("run", "--sweep", "--points", 1, "--angled", 1, "--steps", 3, "--json")
-    words = (*words, "--store", tmp_path / "a.sim", "--indenter", "cube")
+    sweep = ("--sweep", "--points", 1, "--angled", 1, "--steps", 3, "--indenter", "cube")
+    words = ("run", *sweep, "--json", "--store", tmp_path / "a.sim")
     for present in (0, 2):
         told = json.loads(fem(*words).stdout)
         assert told["present"] == present
