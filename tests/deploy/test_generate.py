@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -25,8 +26,15 @@ from palpate.errors import ConfigError, DatasetError, LinkError, MissingExtraErr
 from palpate.files.tape import read_tape
 from palpate_deploy.cli.data import twin_app
 from palpate_deploy.experiment import FemSimulator, specimens_of, with_indenters_met
+from palpate_fem.cli.app import fem_app
 from palpate_fem.electrodes.specimen import SpecimenParameters
-from palpate_fem.population.members import PAPER, Member, draw_members, write_population
+from palpate_fem.population.members import (
+    PAPER,
+    Member,
+    draw_members,
+    read_population,
+    write_population,
+)
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter
 from palpate_training.datasets.experiment import read_experiment, read_mixed
@@ -40,6 +48,7 @@ from palpate_training.experiment.generate.pipeline import (
     TRIALS,
     GeneratedExperiment,
     generate,
+    keep_spec,
     provenance_sha256,
 )
 from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
@@ -100,6 +109,21 @@ def test_both_data_sets_hold_what_was_executed(generated: GeneratedExperiment) -
     moved = np.linalg.norm(mixed.displacement(slice(0, len(mixed))), axis=2)
     assert moved.max(axis=1).min() > 0.2e-3
     assert len(mixed.mesh.subset) == 128
+
+
+def test_specimens_fitted_on_two_presses_are_said_to_be_far_off(
+    generated: GeneratedExperiment, tmp_path: Path
+) -> None:
+    out = tmp_path / "three.json"
+    fitted = CliRunner().invoke(
+        fem_app, ["units", "fit", str(generated.folder / STORE), "--out", str(out)]
+    )
+    assert fitted.exit_code == 1
+    said = " ".join(fitted.output.split())
+    for published in PAPER:
+        assert f"{published.name} is far from what is published: lowest tared value" in said
+    # The paths go 0.2 mm deeper than the paper's, so nobody was pressed deeper than that.
+    assert max(member.overtravel_m for member in read_population(out)) <= 0.2e-3 + 1e-9
 
 
 def test_a_unit_that_stands_wrong_is_pressed_deeper(generated: GeneratedExperiment) -> None:
@@ -467,9 +491,32 @@ def test_a_damaged_spec_is_named(tmp_path: Path) -> None:
     (tmp_path / SPEC_FILE).write_text("{", encoding="utf-8")
     with pytest.raises(ConfigError, match=SPEC_FILE):
         generate(tmp_path, SPEC, specimens(), FemSimulator(), workers=1)
+    (tmp_path / SPEC_FILE).write_text("[]", encoding="utf-8")
+    with pytest.raises(ConfigError, match="no settings"):
+        generate(tmp_path, SPEC, specimens(), FemSimulator(), workers=1)
     (tmp_path / SPEC_FILE).write_text(json.dumps({"schema": "other"}), encoding="utf-8")
     with pytest.raises(ConfigError, match="another experiment"):
         generate(tmp_path, SPEC, specimens(), FemSimulator(), workers=1)
+
+
+def test_a_full_disk_is_not_called_a_damaged_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half(file: Path, *_: object, **__: object) -> None:
+        file.write_bytes(b"{")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    folder = tmp_path / "g"
+    with monkeypatch.context() as full:
+        full.setattr(Path, "write_text", half)
+        with pytest.raises(DatasetError, match=r"experiment\.json.*No space left") as caught:
+            keep_spec(folder, SPEC, specimens())
+    assert "damaged" not in caught.value.remedy
+    assert not list(folder.iterdir())
+    keep_spec(folder, SPEC, specimens())
+    keep_spec(folder, SPEC, specimens())
+    with pytest.raises(ConfigError, match="seed 1 is not 0"):
+        keep_spec(folder, replace(SPEC, seed=1), specimens())
 
 
 def test_processes_answer_every_task_and_hand_errors_on() -> None:

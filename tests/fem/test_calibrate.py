@@ -343,6 +343,18 @@ def test_nothing_to_compare_is_an_error() -> None:
         calibrate(Formula(refuses="sphere_medium"), measure(PLANS[:1]))
 
 
+def test_all_reasons_for_which_nothing_can_be_compared_are_told() -> None:
+    """As on a real finger: paths that begin in the thin skins, and miss most of the thick ones."""
+    simulator = Formula(thicknesses_m=(1.3e-3, 3e-3), stops="sphere_medium", stop_m=3.05e-3)
+    with pytest.raises(SimulationError) as caught:
+        calibrate(simulator, measure(PLANS[:1]))
+    said = caught.value.problem
+    assert "the path begins inside the skin -> none (skin of 1." in said
+    assert "never reaches" in said
+    assert "bounds" not in caught.value.remedy
+    assert "above the skin" in caught.value.remedy
+
+
 def test_result_is_a_file_that_gives_the_parameters_back(tmp_path: Path) -> None:
     found = calibrate(Formula(), measure([NORMAL, PLANS[3]]))  # has an infinite deviation
     path, picture = tmp_path / "fits" / "fit.json", tmp_path / "fit.png"

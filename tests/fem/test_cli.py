@@ -32,7 +32,9 @@ from palpate_fem.cli.run import telling_step
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import COLUMNS
+from palpate_fem.result import IndentationOutcome
 from palpate_fem.store.read import SimulationStore
+from palpate_fem.store.writer import StoreWriter
 from palpate_fem.study import PathRow
 
 fakes: Any = importlib.import_module("fem_fakes")
@@ -176,6 +178,53 @@ def test_a_sweep_is_resumed_and_drawn(tmp_path: Path) -> None:
     assert png.stat().st_size > 10_000
 
 
+def test_what_another_process_runs_is_told(tmp_path: Path) -> None:
+    store, sweep = tmp_path / "a.sim", ("--sweep", "--points", 1, "--angled", 1, "--steps", 3)
+    words = ("run", *sweep, "--store", store, "--indenter", "cube")
+    assert fem(*words).exit_code == 0
+    held = SimulationStore.open(store)
+    taken = next(name for name in held.ids() if name.endswith("/normal"))
+    held.file_of(taken).unlink()
+    with StoreWriter(store, held.fingertip(), shared=True) as other, other.claim(taken):
+        again = fem(*words)
+        assert again.exit_code == 1
+        assert "1 were there already; 1 run by another process" in again.stdout
+        assert "the same command goes on" in again.stdout
+        told = json.loads(fem(*words, "--json").stdout)
+        assert (told["elsewhere"], told["present"]) == (1, 1)
+    assert fem(*words).exit_code == 0
+
+
+def test_one_press_that_another_process_runs_is_told(tmp_path: Path) -> None:
+    store = tmp_path / "a.sim"
+    words = ("run", "--steps", 3, "--store", store)
+    assert json.loads(fem(*words, "--json").stdout)["elsewhere"] == 0
+    held = SimulationStore.open(store)
+    (name,) = held.ids()
+    held.file_of(name).unlink()
+    with StoreWriter(store, held.fingertip(), shared=True) as other, other.claim(name):
+        again = fem(*words, "--png", tmp_path / "a.png")
+    assert again.exit_code == 1
+    assert "run by another process" in again.stdout
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_json_of_a_sweep_has_a_line_for_each_trajectory_that_the_store_holds(
+    tmp_path: Path,
+) -> None:
+    sweep = ("--sweep", "--points", 1, "--angled", 1, "--steps", 3, "--indenter", "cube")
+    words = ("run", *sweep, "--json", "--store", tmp_path / "a.sim")
+    for present in (0, 2):
+        told = json.loads(fem(*words).stdout)
+        assert told["present"] == present
+        rows = {one["name"]: one for one in told["trajectories"]}
+        assert len(rows) == 2
+        press = next(one for name, one in rows.items() if name.endswith("/normal"))
+        assert press["outcome"] == "complete"
+        assert press["steps_converged"] == press["steps_total"] == 3
+        assert press["peak_force_n"] > 0.0
+
+
 def test_one_press_into_a_store_is_run_once(tmp_path: Path) -> None:
     words = ("run", "--steps", 3, "--store", tmp_path / "a.sim")
     assert "1 of 1 run" in fem(*words).stdout
@@ -214,6 +263,22 @@ def test_a_store_keeps_stress_of_all_or_of_none(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="with stress"):
         fem("run", "--steps", 4, "--store", with_stress)
     assert fem("run", "--steps", 4, "--store", with_stress, "--stress").exit_code == 0
+
+
+def test_stress_is_not_mixed_with_what_ran_out_of_time_without(tmp_path: Path) -> None:
+    store = tmp_path / "a.sim"
+    assert fem("run", "--steps", 5, "--store", store).exit_code == 0
+    held = SimulationStore.open(store)
+    (name,) = held.ids()
+    whole = held.trajectory(name)
+    held.file_of(name).unlink()
+    with StoreWriter(store, held.fingertip()) as writer:
+        late = replace(whole, steps=whole.steps[:2], outcome=IndentationOutcome.DEADLINE)
+        writer.write(name, late)
+    with pytest.raises(DatasetError, match="without stress"):
+        fem("run", "--steps", 3, "--store", store, "--stress")
+    # The one that is there is run again, so it may have stress then.
+    assert fem("run", "--steps", 5, "--store", store, "--stress").exit_code == 0
 
 
 @pytest.mark.parametrize(

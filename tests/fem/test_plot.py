@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 from collections import Counter
 from collections.abc import Callable
@@ -18,7 +19,6 @@ from palpate_fem.plot.step import plot_step, von_mises
 from palpate_fem.plot.trajectories import plot_overview, travel_m
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.store.content import Outline, StoredFingertip, TrajectorySummary
-from palpate_fem.store.files import StoreDiskError
 
 sample: Any = importlib.import_module("stored_sample")
 INNER_M: float = sample.INNER_M
@@ -166,9 +166,26 @@ def test_what_cannot_be_drawn_is_refused(
     with pytest.raises(DatasetError, match="no trajectory"):
         plot_overview([], path)
     path.mkdir()
-    with pytest.raises(StoreDiskError, match="cannot write") as caught:
+    with pytest.raises(DatasetError, match="cannot write"):
         plot_step(tip, press, path)
-    assert "kept" not in caught.value.remedy, "nothing is kept but in a store"
+
+
+def test_a_full_disk_leaves_the_picture_that_was_there(
+    tip: StoredFingertip, press: IndentationResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "step.png"
+    plot_step(tip, press, path)
+    before = path.read_bytes()
+
+    def half(_: Any, file: Path, **__: Any) -> None:
+        Path(file).write_bytes(before[: len(before) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", half)
+    with pytest.raises(DatasetError, match="No space left"):
+        plot_step(tip, press, path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_overview_counts_outcomes(press: IndentationResult, tmp_path: Path) -> None:

@@ -139,6 +139,20 @@ def test_population_round_trip_and_refusals(tmp_path: Path) -> None:
         path.write_text(json.dumps(broken), encoding="utf-8")
         with pytest.raises(ConfigError, match=word):
             read_population(path)
+    for value, problem, remedy in (
+        ({"sigma_s_m": -1.0}, "a member: sigma_s_m = -1", "SI"),
+        ({"colour": 1.0}, "a member: unknown key 'colour' of a specimen", "asperity_m, "),
+    ):
+        broken = json.loads(json.dumps(content))
+        broken["members"][0]["unit"] |= value
+        path.write_text(json.dumps(broken), encoding="utf-8")
+        with pytest.raises(ConfigError) as caught:
+            read_population(path)
+        assert problem in caught.value.problem
+        assert "->" not in caught.value.problem, "one error, not two in a row"
+        assert remedy in caught.value.remedy
+    names = caught.value.remedy.removeprefix("known are ").split(", ")
+    assert names == sorted(names)
     with pytest.raises(ConfigError, match="nowhere"):
         read_population(tmp_path / "nowhere.json")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from palpate.bus.topics import TOPICS, sensor_key
-from palpate.errors import RecordingError
+from palpate.errors import DatasetError, RecordingError
 from palpate.files.record_writer import RecordWriter
 from palpate.messages import (
     ElectrodeFrame,
@@ -197,6 +198,27 @@ def test_the_picture_is_drawn_and_not_of_one_colour(
     share = coloured[: len(pixels) // 3].mean()
     assert share > 0.05 if fields else share < 0.01
     assert coloured[len(pixels) // 2 :].mean() > 0.002  # curves
+
+
+def test_a_full_disk_leaves_the_picture_that_was_there(
+    stamp: Stamp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figure = pytest.importorskip("matplotlib.figure")
+    from palpate_services.viewer.plot import plot_record
+
+    record = record_of(tmp_path / "a.mcap", stamp, [Press(float(at), 0.1) for at in range(4)])
+    picture = tmp_path / "a.png"
+    picture.write_bytes(b"a good one")
+
+    def half(_: object, file: Path, **__: object) -> None:
+        Path(file).write_bytes(b"a go")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(figure.Figure, "savefig", half)
+    with pytest.raises(DatasetError, match="No space left"):
+        plot_record(record, picture)
+    assert picture.read_bytes() == b"a good one"
+    assert sorted(tmp_path.iterdir()) == [record, picture]
 
 
 def test_a_record_without_estimates_is_refused(stamp: Stamp, tmp_path: Path) -> None:

@@ -58,6 +58,20 @@ def test_fields_and_rows_are_those_of_the_parts(large: MixedDataset) -> None:
     assert few.basis.loss_mean > both.basis.loss_mean
 
 
+def test_what_the_parts_had_lost_is_said(large: MixedDataset) -> None:
+    def lossy(data: MixedDataset, mean: float, most: float) -> MixedDataset:
+        return replace(data, basis=replace(data.basis, loss_mean=mean, loss_max=most))
+
+    parts = [lossy(large, 0.92e-6, 57.7e-6), lossy(other_skin(large), 0.86e-6, 101.8e-6)]
+    both = join_mixed(parts, ["a", "b"], modes=1000, force_modes=1000)
+    said = both.experiment.provenance.notes
+    assert "themselves lose up to 9.2e-07 m of the displacement on average, 0.000102 at" in said
+    assert "N of the contact forces on average" in said
+    # The losses of a join of joins are beside the joins', whose own stay said.
+    more = join_mixed([both, parts[0]], ["ab", "c"], modes=1000, force_modes=1000)
+    assert said in more.experiment.provenance.notes
+
+
 def test_common_modes_are_those_of_the_whole_fields(large: MixedDataset) -> None:
     parts = [large, subset(other_skin(large), range(3))]
     few = join_mixed(parts, ["a", "b"], modes=4, force_modes=3)

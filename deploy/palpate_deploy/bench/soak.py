@@ -24,6 +24,7 @@ from rich.table import Table
 from palpate.bus import Delivery, Session, Subscriber
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS
 from palpate.errors import ConfigError, ErrorCode, RemoteError, StreamTimeout
+from palpate.files.atomic import written_whole
 from palpate.process import require, stop_on_signals
 from palpate_deploy.bench.growth import (
     BINS,
@@ -399,4 +400,5 @@ def draw(
     room.set_xlabel("time [min]")
     memory.set_title("memory of each process of a station")
     room.set_title("records and views on the disk")
-    figure.savefig(picture, dpi=110)
+    with written_whole(picture) as partial:
+        figure.savefig(partial, dpi=110, format="png")

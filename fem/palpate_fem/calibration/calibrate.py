@@ -121,7 +121,7 @@ class _Search:
             state = self.simulate([np.append(state.point, volume)])[0]
             fit = self.evaluate(state, "start")
             if not math.isfinite(fit.cost):
-                raise _hopeless(self.cases, fit)
+                raise _hopeless(self.cases, [state], [fit])
         return self.refine(state, fit)
 
     def simulate(self, points: Sequence[Floats]) -> list[SimulatedPoint]:
@@ -194,10 +194,9 @@ class _Search:
             if not none_left and failed[worst] <= len(fair) / 2:
                 best = int(np.argmin([fit.cost for fit in fits]))
                 return states[best], fits[best]
-            fit = next(fit for fit in fair if worst in fit.failures)
             if len(self.cases) == 1:
-                raise _hopeless(self.cases, fit)
-            states = self.drop(worst, f"simulation: {fit.failures[worst]}", states)
+                raise _hopeless(self.cases, states, fits)
+            states = self.drop(worst, f"simulation: {_reasons(worst, states, fits)}", states)
 
     def refine(self, state: SimulatedPoint, fit: ModulusFit) -> Calibration:
         """Step to the optimum; each step is confirmed by runs."""
@@ -316,9 +315,22 @@ class _Search:
         )
 
 
-def _hopeless(cases: Sequence[CalibrationCase], fit: ModulusFit) -> SimulationError:
-    reasons = "; ".join(f"{cases[i].item.name}: {why}" for i, why in fit.failures.items())
+def _reasons(which: int, states: Sequence[SimulatedPoint], fits: Sequence[ModulusFit]) -> str:
+    """Why a case failed, each different reason with the skins at which it did."""
+    skins: dict[str, dict[str, None]] = {}
+    for state, fit in zip(states, fits, strict=True):
+        if which in fit.failures:
+            skins.setdefault(fit.failures[which], {})[f"{1e3 * state.point[0]:.2f}"] = None
+    return "; ".join(f"{why} (skin of {', '.join(mm)} mm)" for why, mm in skins.items())
+
+
+def _hopeless(
+    cases: Sequence[CalibrationCase], states: Sequence[SimulatedPoint], fits: Sequence[ModulusFit]
+) -> SimulationError:
+    failed = sorted({which for fit in fits for which in fit.failures})
+    reasons = "; ".join(f"{cases[i].item.name}: {_reasons(i, states, fits)}" for i in failed)
     return SimulationError(
         f"no simulation can be compared with its measurement ({reasons})",
-        remedy="check indenter, sensor frame, path and total thickness, or give other bounds",
+        remedy="check indenter, sensor frame, path and total thickness; begin paths some 0.5 mm"
+        " above the skin: fingers of all thicknesses are tried",
     )

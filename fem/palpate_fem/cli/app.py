@@ -563,8 +563,12 @@ def fit(
     store: Annotated[Path, typer.Argument(metavar="STORE", help="Simulated trajectories.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE.json", help="Where to write.")],
     overtravel_mm: Annotated[
-        float, typer.Option(help="Depth of the paths beyond the paper's [mm].")
-    ] = 0.6,
+        float | None,
+        typer.Option(
+            help="How much deeper than the paper's a specimen may have been pressed [mm].",
+            show_default="as the paths of STORE",
+        ),
+    ] = None,
     recording: Annotated[
         Path | None,
         typer.Option(
@@ -594,8 +598,8 @@ def fit(
         _refuse_given(context, {"sensor", "touches", "held_rows"}, "without --recording")
         from palpate_fem.cli.identify import fit_units_command
 
-        fit_units_command(store, out, overtravel_m=overtravel_mm * 1e-3)
-        return
+        overtravel_m = None if overtravel_mm is None else overtravel_mm * 1e-3
+        raise typer.Exit(fit_units_command(store, out, overtravel_m=overtravel_m))
     _refuse_given(context, {"overtravel_mm"}, "with --recording")
     from palpate_fem.cli.identify import fit_sensor_command
 

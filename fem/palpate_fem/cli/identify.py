@@ -8,6 +8,7 @@ that method on known parameters, ``validate`` compares simulated with measured f
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ import typer
 from rich.markup import escape
 from rich.progress import Progress
 
-from palpate.errors import ConfigError
+from palpate.errors import ConfigError, DatasetError
 from palpate.files.outputs import check_folder, check_output
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
@@ -36,7 +37,7 @@ from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
 from palpate_fem.plot.validation import plot_calibration, plot_examples, plot_indenters
-from palpate_fem.population.fitting import deep_states, fit_member
+from palpate_fem.population.fitting import deep_states, fit_member, misses
 from palpate_fem.population.members import (
     PAPER,
     Member,
@@ -62,6 +63,7 @@ from palpate_fem.validation.validate import (
 
 CALIBRATION_HEADINGS = ("parameter", "value", "deviation", "force per 1 %", "bounds", "remark")
 _LIMIT_S = 900.0  # of one run; the slowest trajectory takes a tenth of it
+_SAME_M = 1e-6  # depths of paths differ by rounding
 
 
 def calibrate_command(
@@ -286,17 +288,69 @@ def _recovery_json(recovery: ParameterRecovery, noise_n: float, seed: int) -> di
     }
 
 
+_PAPER_PRESS = re.compile(r".+/(?:(?P<normal>normal)|angled-\d+)")
+
+
 def planned_travel_m(name: str) -> float:
-    """Planned travel of a trajectory of the paper, from its first pose on [m], by its name."""
-    return CLEARANCE_M + (NORMAL_DEPTH_M if name.endswith("/normal") else ANGLED_DEPTH_M)
+    """Planned travel of a press of the paper, from its first pose on [m], by its name.
+
+    Raises:
+        DatasetError: It is no such press.
+    """
+    press = _PAPER_PRESS.fullmatch(name)
+    if press is None:
+        raise DatasetError(
+            f"{name} is none of the paper's presses, to whose ranges specimens are fitted",
+            remedy="give a store of palpate data generate without --random and --path",
+        )
+    return CLEARANCE_M + (NORMAL_DEPTH_M if press["normal"] else ANGLED_DEPTH_M)
 
 
-def fit_units_command(store: Path, out: Path, *, overtravel_m: float) -> None:
-    """Fit the paper's three specimens on a store of the whole set, and write the population."""
+def store_overtravel_m(store: SimulationStore) -> float:
+    """How much deeper than the paper's all presses of a store are planned at least [m].
+
+    Raises:
+        DatasetError: It holds none, others, or shorter ones.
+    """
+    beyond = [
+        float(np.linalg.norm(path[-1, :3] - path[0, :3])) - planned_travel_m(name)
+        for name in store.ids()
+        for path in (store.summary(name).path,)
+    ]
+    if not beyond:
+        raise DatasetError(f"{store.path} holds no trajectory", remedy="simulate some first")
+    if min(beyond) < -_SAME_M:
+        raise DatasetError(
+            f"{store.path}: a press ends {-1e3 * min(beyond):.3g} mm short of the paper's depth",
+            remedy="give a store of palpate data generate",
+        )
+    return max(0.0, min(beyond))
+
+
+def fit_units_command(store: Path, out: Path, *, overtravel_m: float | None) -> int:
+    """Fit the paper's three specimens on a store of the whole set, and write the population.
+
+    Args:
+        store: Its presses.
+        out: The population.
+        overtravel_m: Most of it that a specimen may have [m]; None = that of the store's paths.
+
+    Returns:
+        1 if a specimen is far from what it was fitted to.
+    """
     check_output(out, "--out", ".json", store)
-    if overtravel_m < 0:
+    if overtravel_m is not None and not overtravel_m >= 0:
         raise ConfigError(f"overtravel of {overtravel_m} m", remedy="give 0 or more")
     opened = SimulationStore.open(store)
+    most_m = store_overtravel_m(opened)
+    if overtravel_m is not None and overtravel_m > most_m + _SAME_M:
+        raise ConfigError(
+            f"--overtravel-mm {1e3 * overtravel_m:g}, but the presses of {store} go only "
+            f"{1e3 * most_m:.3g} mm deeper than the paper's",
+            remedy="leave it out, or simulate deeper presses",
+        )
+    if overtravel_m is not None:
+        most_m = overtravel_m
     fingertip = opened.fingertip()
     geometry = geometry_of(fingertip)
     sensor = ElectrodeModel(geometry)
@@ -310,14 +364,18 @@ def fit_units_command(store: Path, out: Path, *, overtravel_m: float) -> None:
         bar.update(task, description="specimens", total=len(PAPER), completed=0)
         members: list[Member] = []
         for number, published in enumerate(PAPER, 1):
-            members.append(
-                fit_member(geometry, rest, states, published, number, most_m=overtravel_m)
-            )
+            members.append(fit_member(geometry, rest, states, published, number, most_m=most_m))
             bar.advance(task)
     source = f"{len(ids)} trajectories of the fingertip {fingertip.key[:12]}"
     write_population(out, members, source=source)
     _show_members(members)
     print_lines(f"wrote {out}")
+    missed = {member.specimen.name: far for member in members if (far := misses(member))}
+    for name, far in missed.items():
+        print_lines(f"{name} is far from what is published: {', '.join(far)}")
+    if missed:
+        print_lines("these presses do not come to that: simulate the paper's whole set")
+    return 1 if missed else 0
 
 
 def fit_sensor_command(

@@ -8,7 +8,7 @@ import math
 import statistics
 import uuid
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -230,7 +230,7 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
 
     Returns:
         0, or 1 if a trajectory, of those that were there already, too, neither completed nor ended
-        at the force limit.
+        at the force limit, or is run by another process.
     """
     options.check()
     sweep, store = options.sweep, options.store
@@ -243,7 +243,8 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
         ray=options.ray,
     )
     done: list[IndentationResult] = []
-    present = earlier = 0
+    held: list[TrajectorySummary] = []
+    present = earlier = elsewhere = 0
     with (
         stop_on_signal() as stop,
         make_batch() as batch,
@@ -286,23 +287,25 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
     if store is not None:
         opened = SimulationStore.open(store)
         there = set(opened.ids())
-        held = [plan.name for plan in plans if plan.name in there]
+        held = [opened.summary(plan.name) for plan in plans if plan.name in there]
         new = {early.name for early in report.early}
-        earlier = sum(opened.outcome(name).value not in GOOD for name in held if name not in new)
+        earlier = sum(one.outcome.value not in GOOD for one in held if one.id not in new)
+        if not report.stopped:
+            elsewhere = sum(plan.name not in there | new for plan in plans)
         if not sweep:
-            done = [opened.trajectory(name) for name in held]
+            done = [opened.trajectory(one.id) for one in held]
     if options.as_json:
-        write_json(fingertip, done, report, present, options.places)
+        told = [_summary_json(one) for one in held] if sweep else [_whole_json(one) for one in done]
+        write_json(fingertip, told, report, present, options.places, elsewhere=elsewhere)
     else:
         if sweep:
-            assert store is not None
-            show_summaries(store, [plan.name for plan in plans])
+            show_summaries(held, title=str(store))
         for trajectory in done:
             show_trajectory(fingertip, trajectory)
-        show_report(report, present, store, options.places, earlier=earlier)
+        show_report(report, present, store, options.places, earlier=earlier, elsewhere=elsewhere)
     if options.png is not None:
         _draw(options.png, fingertip, done, store if sweep else None)
-    failed = earlier or any(early.how not in GOOD for early in report.early)
+    failed = earlier or elsewhere or any(early.how not in GOOD for early in report.early)
     return 1 if report.stopped or failed else 0
 
 
@@ -420,15 +423,11 @@ def show_trajectory(fingertip: StoredFingertip, trajectory: IndentationResult) -
     )
 
 
-def show_summaries(store: Path, names: Sequence[str]) -> None:
-    """Print what a store holds of these trajectories, one row for each indenter."""
-    opened = SimulationStore.open(store)
-    there = set(opened.ids())
+def show_summaries(summaries: Sequence[TrajectorySummary], *, title: str) -> None:
+    """Print trajectories, one row for each indenter."""
     groups: dict[str, list[TrajectorySummary]] = defaultdict(list)
-    for name in names:
-        if name in there:
-            summary = opened.summary(name)
-            groups[summary.indenter].append(summary)
+    for summary in summaries:
+        groups[summary.indenter].append(summary)
     rows = []
     for indenter, found in groups.items():
         complete, limit = (
@@ -448,7 +447,7 @@ def show_summaries(store: Path, names: Sequence[str]) -> None:
             )
         )
     headings = ("indenter", "run", "complete", "force limit", "other", "peak |F| N", "s each")
-    print_table(headings, rows, title=str(store), numbers_from=1)
+    print_table(headings, rows, title=title, numbers_from=1)
 
 
 def show_report(
@@ -458,10 +457,12 @@ def show_report(
     places: Sequence[str] = (),
     *,
     earlier: int = 0,
+    elsewhere: int = 0,
 ) -> None:
     """Print every early end, and a summary; with places also how quick these were.
 
-    Of the ``present`` ones, ``earlier`` ended otherwise than in ``GOOD``.
+    Of the ``present`` ones, ``earlier`` ended otherwise than in ``GOOD``; ``elsewhere`` were
+    claimed by another process.
     """
     if report.early:
         more = len(report.early) - _SHOWN_EARLY
@@ -490,15 +491,21 @@ def show_report(
         parts.append("stopped early; the same command goes on" if store else "stopped early")
     if report.failed and store:
         parts.append(f"{report.failed} {FAILED}: the same command tries them again")
+    if elsewhere:
+        parts.append(
+            f"{elsewhere} run by another process, or lost with it: the same command goes on"
+        )
     print_lines("; ".join(parts))
 
 
 def write_json(
     fingertip: StoredFingertip,
-    trajectories: Sequence[IndentationResult],
+    trajectories: Sequence[Mapping[str, Any]],
     report: BatchReport,
     present: int,
     places: Sequence[str],
+    *,
+    elsewhere: int,
 ) -> None:
     """Print everything except nodal fields as JSON on stdout."""
     content = {
@@ -513,24 +520,45 @@ def write_json(
         },
         "outcomes": dict(report.outcomes),
         "present": present,
+        "elsewhere": elsewhere,
         "stopped": report.stopped,
         "devices": list(places),
         "on_cpu": report.on_cpu,
         "wall_s": report.wall_s,
         "early": [asdict(early) for early in report.early],
-        "trajectories": [
-            {
-                "indenter": trajectory.indenter,
-                "outcome": trajectory.outcome.value,
-                "reason": trajectory.reason,
-                "travel_m": trajectory.travel_m,
-                "seconds": trajectory.seconds,
-                "steps": [_step_json(step) for step in trajectory.steps],
-            }
-            for trajectory in trajectories
-        ],
+        "trajectories": list(trajectories),
     }
     typer.echo(json.dumps(content, indent=1, allow_nan=False))
+
+
+def _whole_json(trajectory: IndentationResult) -> dict[str, Any]:
+    """A trajectory with its steps."""
+    return {
+        **_ending_json(trajectory),
+        "steps": [_step_json(step) for step in trajectory.steps],
+    }
+
+
+def _summary_json(summary: TrajectorySummary) -> dict[str, Any]:
+    """A trajectory of a sweep, which may have hundreds."""
+    force = np.linalg.norm(summary.force, axis=1)
+    return {
+        "name": summary.id,
+        **_ending_json(summary),
+        "steps_converged": len(force),
+        "steps_total": len(summary.path) - 1,
+        "peak_force_n": float(force.max(initial=0.0)),
+    }
+
+
+def _ending_json(trajectory: IndentationResult | TrajectorySummary) -> dict[str, Any]:
+    return {
+        "indenter": trajectory.indenter,
+        "outcome": trajectory.outcome.value,
+        "reason": trajectory.reason,
+        "travel_m": trajectory.travel_m,
+        "seconds": trajectory.seconds,
+    }
 
 
 def _step_json(step: IndentationStep) -> Any:

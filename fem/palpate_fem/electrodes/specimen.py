@@ -227,7 +227,8 @@ class SpecimenParameters:
         known = {field.name for field in fields(cls)}
         if unknown := sorted(set(values) - known):
             raise ConfigError(
-                f"unknown key {unknown[0]!r} of a specimen", remedy=f"known are {', '.join(known)}"
+                f"unknown key {unknown[0]!r} of a specimen",
+                remedy=f"known are {', '.join(sorted(known))}",
             )
         typed: dict[str, Any] = {
             key: tuple(value) if isinstance(value, list) else value for key, value in values.items()

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from palpate.errors import ConfigError
+from palpate.files.bounded import plain_number
 from palpate_fem.arrays import Floats
 
 COLUMNS = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
@@ -159,7 +160,7 @@ def read_path(file: str | Path) -> Floats:
 
 def _number(cell: str, file: Path, line: int, column: str) -> float:
     try:
-        return float(cell)
+        return plain_number(cell)
     except ValueError as error:
         raise ConfigError(
             f"{file}, line {line}: {column} = {cell[:40]!r} is not a number",
@@ -352,7 +353,7 @@ def _segment(words: str) -> PathSegment:
 
 def _finite(word: str, words: str) -> float:
     try:
-        value = float(word)
+        value = plain_number(word)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

@@ -70,7 +70,7 @@ def plot_step(
 
     Raises:
         ConfigError: There is no such step, or stress was not stored.
-        StoreDiskError: The disk is full or refuses.
+        DatasetError: The disk is full or refuses.
         MissingExtraError: matplotlib is not installed.
     """
     shown = _chosen(trajectory, step, quantity)

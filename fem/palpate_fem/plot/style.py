@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from palpate.files.atomic import written_whole
 from palpate.process import require
 from palpate_fem.result import IndentationOutcome
-from palpate_fem.store.files import disk_error
 
 INK = "#30343b"
 GRID = "#e4e4e8"
@@ -39,16 +39,13 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def save(figure: Any, path: Path) -> None:
-    """Write a figure as PNG.
+    """Write a figure as PNG, whole or not at all.
 
     Raises:
-        StoreDiskError: The disk is full or refuses.
+        DatasetError: The disk is full or refuses.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=120, format="png")
-    except OSError as error:
-        raise disk_error(path, error) from error
+    with written_whole(path) as partial:
+        figure.savefig(partial, dpi=120, format="png")
 
 
 def label(axes: Any, across: str, up: str, title: str = "") -> None:

@@ -80,7 +80,7 @@ def plot_overview(
 
     Raises:
         DatasetError: There is no trajectory.
-        StoreDiskError: The disk is full or refuses.
+        DatasetError: The disk is full or refuses.
         MissingExtraError: matplotlib is not installed.
     """
     if not summaries:

@@ -36,7 +36,7 @@ def plot_calibration(result: Calibration, path: Path) -> None:
         path: The PNG to write; the first six trajectories are drawn.
 
     Raises:
-        StoreDiskError: The disk is full or refuses.
+        DatasetError: The disk is full or refuses.
         MissingExtraError: matplotlib is not installed.
     """
     groups: dict[str, list[TrajectoryFit]] = {}
@@ -86,7 +86,7 @@ def plot_examples(validation: Validation, path: Path) -> None:
         path: The PNG to write.
 
     Raises:
-        StoreDiskError: The disk is full or refuses.
+        DatasetError: The disk is full or refuses.
         MissingExtraError: matplotlib is not installed.
     """
     chosen = examples(validation)
@@ -149,7 +149,7 @@ def plot_indenters(validation: Validation, path: Path) -> None:
         path: The PNG to write.
 
     Raises:
-        StoreDiskError: The disk is full or refuses.
+        DatasetError: The disk is full or refuses.
         MissingExtraError: matplotlib is not installed.
     """
     rows = validation.by_indenter
@@ -205,7 +205,7 @@ def plot_study(rows: Sequence[StudyRow], path: Path) -> None:
         path: PNG to write.
 
     Raises:
-        StoreDiskError: The disk is full or refuses.
+        DatasetError: The disk is full or refuses.
     """
     meshes = len({row.edge_m for row in rows}) > 1
     figure = new_figure(12.0, 3.6)

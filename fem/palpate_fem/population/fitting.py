@@ -269,3 +269,30 @@ def fit_member(
         "states": float(len(gaps)),
     }
     return Member(specimen, published, float(OVERTRAVELS_M[extra]), found)
+
+
+MISSED_RANGE = 0.05
+MISSED_FORCE = 0.3
+"""A specimen that misses its range [full scale] or its force (relative) by more is not fitted.
+
+The shipped specimens miss them by at most 0.012 and 0.21.
+"""
+
+
+def misses(member: Member) -> list[str]:
+    """What a fitted specimen is far from, in words for people: found and published value."""
+    published = member.published
+    if published is None:
+        return []
+    far = [
+        f"{what} {member.found[key]:.3f}, not {wanted:g}"
+        for what, key, wanted in (
+            ("lowest tared value", "low", published.low),
+            ("highest", "high", published.high),
+        )
+        if not abs(member.found[key] - wanted) <= MISSED_RANGE
+    ]
+    force = member.found["max_force_n"]
+    if not abs(force / published.max_force_n - 1.0) <= MISSED_FORCE:
+        far.append(f"largest force {force:.1f} N, not {published.max_force_n:g} N")
+    return far

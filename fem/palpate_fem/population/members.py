@@ -176,10 +176,12 @@ def read_population(path: Path | None = None) -> tuple[Member, ...]:
         raise ConfigError(f"{where} does not have the schema {SCHEMA}", remedy=_REMEDY)
     try:
         members = tuple(_member(entry) for entry in content["members"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ConfigError(
-            f"{where}: a member lacks or misplaces {error}", remedy=_REMEDY
-        ) from error
+    except ConfigError as error:
+        raise ConfigError(f"{where}: a member: {error.problem}", remedy=error.remedy) from error
+    except KeyError as error:
+        raise ConfigError(f"{where}: a member lacks {error}", remedy=_REMEDY) from error
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{where}: a member: {error}", remedy=_REMEDY) from error
     names = [member.specimen.name for member in members]
     if not names or len(set(names)) != len(names):
         raise ConfigError(

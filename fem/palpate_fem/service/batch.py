@@ -352,6 +352,9 @@ def sweep_into_store(
         _check_paths(path, [plan for plan in plans if plan.name in done])
         if stress or left:
             _check_stress(store, sorted(done), stress=stress)
+            # What has no end there stays beside these, unless they are to end it.
+            beside = set(store.ids()) - done - {plan.name for plan in plans}
+            _check_stress(store, sorted(beside), stress=stress)
         claims: dict[str, TrajectoryClaim] = {}
         unmade: list[EarlyEnd] = []
 
@@ -410,13 +413,13 @@ def _check_paths(store: Path, known: Sequence[TrajectoryPlan]) -> None:
             )
 
 
-def _check_stress(store: SimulationStore, done: Sequence[str], *, stress: bool) -> None:
+def _check_stress(store: SimulationStore, names: Sequence[str], *, stress: bool) -> None:
     """Check that trajectories that are there, three of them, have stress as others will.
 
     Raises:
         DatasetError: One differs.
     """
-    for name in {done[0], done[len(done) // 2], done[-1]} if done else ():
+    for name in {names[0], names[len(names) // 2], names[-1]} if names else ():
         with store.group(name) as group:
             differs = len(group["pose"]) > 0 and ("stress" in group) is not stress
         if differs:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO
 
 from palpate.errors import RecordingError
+from palpate.files.bounded import plain_number
 from palpate.messages import Pose
 from palpate.rigid import is_rotation, quaternion_length
 from palpate_gateway.pose.placement import REACH_M
@@ -211,7 +212,6 @@ class PoseTable:
 
 def _number(text: str) -> float | None:
     try:
-        # Python also reads 1_000 and the digits of all scripts.
-        return float(text) if text.isascii() and "_" not in text else None
+        return plain_number(text)
     except ValueError:
         return None

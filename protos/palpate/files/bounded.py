@@ -62,6 +62,18 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     return data
 
 
+def plain_number(text: str) -> float:
+    """The number that a cell or a word says, as every other program reads it; may be nan or inf.
+
+    Raises:
+        ValueError: It is none.
+    """
+    # Python also reads 1_0, and the digits of all scripts.
+    if "_" in text or not text.isascii():
+        raise ValueError("it is not a number")
+    return float(text)
+
+
 def parse_json(text: bytes) -> Any:
     """The value of a JSON text: finite numbers only, each key once, nested moderately.
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from palpate.files.atomic import written_whole
 from palpate.process import require
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.viewer.timeline import MatchedMessages
@@ -40,6 +41,7 @@ def plot_record(
     Raises:
         ConfigError: One of ``bundles`` does not exist.
         RecordingError: The record is damaged or holds no estimates.
+        DatasetError: The disk is full or refuses.
         MissingExtraError: matplotlib is not installed.
     """
     figures = require("matplotlib.figure", extra="services")
@@ -55,8 +57,8 @@ def plot_record(
     shown_s = None if touch is None else (touch.time_ns - int(touches.times_ns[0])) * 1e-9
     _draw_curves(below, seconds, touches.matched, shown_s)
     figure.suptitle(_headline(errors), fontsize=14, color=INK)
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(picture, dpi=110)
+    with written_whole(picture) as partial:
+        figure.savefig(partial, dpi=110, format="png")
     return errors
 
 

@@ -87,6 +87,8 @@ def join_mixed(
 ) -> MixedDataset:
     """Put mixed data sets together; what the common modes lose is beside the given fields.
 
+    What these had lost already comes on top; the provenance says how much.
+
     Args:
         parts: At least one; all with contact forces, or none.
         names: Of each part; trajectories are called after it: presses of different fingertips may
@@ -127,11 +129,16 @@ def join_mixed(
     where = joined_provenance(
         [part.experiment.provenance for part in parts], [*map(content_sha256, parts)], command
     )
-    where = replace(
-        where,
-        notes=f"{where.notes}; nodes are those of {names[0]}, the others' up to"
-        f" {apart * 1e3:.2f} mm away; losses of fields are beside theirs",
-    )
+    notes = [
+        f"{where.notes}; nodes are those of {names[0]}, the others' up to"
+        f" {apart * 1e3:.2f} mm away; losses of fields are beside theirs, which themselves lose up"
+        f" to {_largest_losses([one.basis for one in parts], 'm of the displacement')}"
+    ]
+    if contacts:
+        notes[0] += f", {_largest_losses([c.basis for c in contacts], 'N of the contact forces')}"
+    # A part that was joined or shrunk itself says there what was lost before.
+    notes += dict.fromkeys(text for one in parts if (text := one.experiment.provenance.notes))
+    where = replace(where, notes="; of parts: ".join(notes))
     return MixedDataset(
         experiment=join_experiments([part.experiment for part in parts], names, where),
         simulated_force=np.concatenate([part.simulated_force for part in parts]),
@@ -140,6 +147,11 @@ def join_mixed(
         mesh=first.mesh,
         contact=contact,
     )
+
+
+def _largest_losses(bases: Sequence[FieldBasis], what: str) -> str:
+    mean, most = max(one.loss_mean for one in bases), max(one.loss_max for one in bases)
+    return f"{mean:.3g} {what} on average, {most:.3g} at most"
 
 
 def join_experiments(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from palpate import __version__
 from palpate.cluster import RayCluster, WorkerLostError
-from palpate.errors import ConfigError
+from palpate.errors import ConfigError, DatasetError
 from palpate.files.atomic import written_whole
 from palpate.process import check_installed
 from palpate_training.datasets.container import Provenance
@@ -250,7 +250,9 @@ def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen])
     """Write the settings into the experiment's folder, or compare them with those that are there.
 
     Raises:
-        ConfigError: The folder holds another experiment; says what differs.
+        ConfigError: The folder holds another experiment, says what differs; or its settings are
+            damaged.
+        DatasetError: The disk refuses.
     """
     wanted: dict[str, Any] = {
         "schema": SPEC_SCHEMA,
@@ -260,14 +262,19 @@ def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen])
     wanted = json.loads(json.dumps(wanted))  # tuples become lists, as in the file
     path = folder / SPEC
     try:
-        if not path.exists():
-            folder.mkdir(parents=True, exist_ok=True)
-            partial = path.with_name(f".{SPEC}.part")
-            partial.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8")
-            partial.replace(path)
-            return
         found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        if not isinstance(found, dict):
+            raise ValueError("it holds no settings")
+    except (FileNotFoundError, NotADirectoryError):
+        with written_whole(path) as part:
+            part.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8")
+        return
+    except OSError as error:
+        raise DatasetError(
+            f"{path} cannot be read: {error.strerror or error}",
+            remedy="check the folder's rights, or name another",
+        ) from error
+    except ValueError as error:
         raise ConfigError(
             f"{path}: {error}", remedy="name another folder, or remove the damaged file"
         ) from error
