@@ -58,8 +58,8 @@ def disk_error(folder: Path, why: str) -> DiskError:
         left = "free space unknown"
     return DiskError(
         f"recording to {folder} is paused: {why} ({left})",
-        remedy="free some space, see that the folder may be written, or change recorder.out; "
-        "recording resumes by itself",
+        remedy="free some space, and see that the folder may be written: recording resumes by "
+        "itself; or record elsewhere: recorder.out, or --out of `palpate record`",
     )
 
 
@@ -238,7 +238,8 @@ class RecordFiles:
         except OSError as error:
             raise RecordingError(
                 f"recorder.out = {self._config.out}: {error.strerror}",
-                remedy="set recorder.out to a folder this user may write to",
+                remedy="name a folder that this user may write to: recorder.out, or --out of "
+                "`palpate record`",
             ) from error
 
     def write(self, sample: TapSample) -> None:
