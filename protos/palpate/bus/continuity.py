@@ -233,17 +233,19 @@ class Holes:
     def __init__(self) -> None:
         self._sources: dict[str, tuple[Counter[str], Continuity[None]]] = {}
 
-    def take(self, key: str, stamp: Stamp, *, arrived_ns: int, serial: str = "") -> int:
+    def take(
+        self, key: str, stamp: Stamp, *, arrived_ns: int, serial: str = "", lost_here: int = 0
+    ) -> int:
         """How many messages a newcomer shows to be missing, e.g. 0.
 
-        ``serial`` and ``arrived_ns`` as in ``Continuity.take``.
+        ``serial``, ``arrived_ns`` and ``lost_here`` as in ``Continuity.take``.
         """
         if key not in self._sources:
             new: Counter[str] = Counter()
             self._sources[key] = new, Continuity(new, contiguous=True)
         counters, continuity = self._sources[key]
         before = counters["lost_on_bus"]
-        continuity.take(None, stamp, serial=serial, arrived_ns=arrived_ns)
+        continuity.take(None, stamp, serial=serial, arrived_ns=arrived_ns, lost_here=lost_here)
         return counters["lost_on_bus"] - before
 
     @property
