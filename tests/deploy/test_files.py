@@ -20,7 +20,7 @@ from palpate.files.record_writer import RecordWriter
 from palpate.health import Health
 from palpate_deploy.demo.bundles import write_virtual_record
 from palpate_deploy.diagnose import records
-from palpate_services.recorder import service
+from palpate_services.recorder import service, writer
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -58,6 +58,63 @@ def test_info_says_that_the_wall_clock_was_set(
     shown = capsys.readouterr().out
     assert "the wall clock was set by +60.0 s" in shown
     assert "100.00" in shown
+
+
+def _without(record: Path, path: Path, lost: range) -> Path:
+    """A copy of a record that lacks these of its electrode frames."""
+    with RecordWriter(path) as writer:
+        for item in read_record(record):
+            if not (item.address.topic == "electrodes" and item.sequence in lost):
+                writer.write(
+                    item.key,
+                    item.schema,
+                    item.payload,
+                    log_time_ns=item.log_time_ns,
+                    sequence=item.sequence,
+                )
+    return path
+
+
+def test_info_tells_what_never_came(
+    virtual_record: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = _without(virtual_record, tmp_path / "hole.mcap", range(100, 237))
+    records.show_info(path, as_json=True)
+    lost = json.loads(capsys.readouterr().out)["lost"]
+    assert {key.rpartition("/")[2]: n for key, n in lost.items()} == {
+        "electrodes": 137,
+        "wrench": 0,
+        "pose": 0,
+    }
+    records.show_info(path, as_json=False)
+    (row,) = (line for line in capsys.readouterr().out.splitlines() if "electrodes" in line)
+    assert row.split("│")[-2].strip() == "137"
+
+
+def test_record_says_that_messages_never_came(
+    link: LinkConfig, virtual_record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "runs"
+    out.mkdir()
+
+    def pause(*_: object, **__: object) -> None:
+        _without(virtual_record, out / "lab.mcap", range(100, 237))
+
+    monkeypatch.setattr(service, "run_recorder", pause)
+    monkeypatch.setattr(records, "stop_on_signals", threading.Event)
+    with pytest.raises(RecordingError, match="137 messages that were published never came"):
+        records.record_station(link, "lab", {"out": out}, duration_s=1.0)
+
+
+def test_record_refuses_a_disk_without_room_at_once(
+    link: LinkConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "free_bytes", lambda _: 8 * 10**6)
+    monkeypatch.setattr(service, "run_recorder", lambda *_, **__: pytest.fail("it began"))
+    with pytest.raises(RecordingError, match="8 MB free, a record needs 268 MB") as refused:
+        records.record_station(link, "lab", {"out": tmp_path / "runs"}, duration_s=1.0)
+    assert "--out" in refused.value.remedy
+    assert not (tmp_path / "runs").exists()
 
 
 def test_truncated_record_is_refused_and_recovered(

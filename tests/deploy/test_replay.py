@@ -19,6 +19,7 @@ from palpate.bus import Session
 from palpate.bus.topics import ELECTRODES, FEATURES
 from palpate.errors import RecordingError
 from palpate.files.record import RecordItem, read_record
+from palpate.files.record_writer import RecordWriter
 from palpate.messages import Status
 from palpate.ros.layouts import BIOTAC_HAND, Dialect, encode
 from palpate_deploy.diagnose.replay import ReplayAccount, replay, replay_profile, run_replay
@@ -86,6 +87,22 @@ def test_record_of_a_virtual_finger(
     account = _replay(palpate, virtual_record, tmp_path / "out")
     recorded = account["recorded"]
     assert {recorded[name] for name in ("electrodes", "wrench", "pose", "features")} == {300}
+
+
+@pytest.mark.parametrize("lost", [range(100, 103), range(21, 281)])
+def test_record_with_a_hole(
+    palpate: Palpate, virtual_record: Path, bundle: str, tmp_path: Path, lost: range
+) -> None:
+    """What its recorder never got is no answer of this replay: it waits for all the others."""
+    holed = tmp_path / "holed.mcap"
+    with RecordWriter(holed) as writer:
+        for item in read_record(virtual_record):
+            if not (item.address.topic == ELECTRODES.name and item.sequence in lost):
+                writer.write(item.key, item.schema, item.payload, log_time_ns=item.log_time_ns)
+    account = _replay(palpate, holed, tmp_path / "out")
+    left = 300 - len(lost)
+    assert (account["frames"], account["missing_frames"]) == (left, len(lost))
+    assert account["recorded"]["features"] == account["estimates"] == left
 
 
 @pytest.mark.parametrize("dialect", ["ros1", "cdr"])
@@ -184,13 +201,19 @@ def test_truncated_log_is_said_and_what_was_read_is_recorded(
     assert account["recorded"]["electrodes"] == account["frames"] == account["estimates"]
 
 
-def test_file_that_is_no_log(palpate: Palpate, bundle: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["text", "bytes", "folder"])
+def test_file_that_is_no_log(palpate: Palpate, bundle: str, tmp_path: Path, kind: str) -> None:
     nonsense = tmp_path / "nonsense.btd"
-    nonsense.write_text("hello\n", encoding="ascii")
+    if kind == "folder":
+        nonsense.mkdir()
+    else:
+        nonsense.write_bytes(b"hello\n" if kind == "text" else bytes(range(256)) * 99)
     result = palpate("replay", nonsense, "--out", tmp_path / "out", "--no-rrd")
     assert result.returncode == 3
     assert "nonsense.btd" in result.stderr
     assert "Traceback" not in result.stderr
+    assert not result.stdout
+    assert not list(tmp_path.glob("out/*")), "a record without a frame"
 
 
 def test_damaged_record(

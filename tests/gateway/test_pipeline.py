@@ -266,6 +266,19 @@ def test_what_a_record_lost_when_it_was_taken_is_told_again_by_its_replay() -> N
     assert replay.counters["frames_published"] == 5
 
 
+def test_frames_that_a_record_lacks_are_missing_in_its_replay() -> None:
+    taken = frames(pushed(pipeline(live=True), readings(100), 0))
+    recorded = [
+        RecordedMessage("electrodes", ELECTRODE_FRAME.encode(frame), 0.01 * i)
+        for i, frame in enumerate(taken)
+        if i not in (10, 11, 12) and not 20 <= i < 80
+    ]
+    replay = pipeline(live=False)
+    pushed(replay, recorded, 0)
+    assert replay.counters["missing_frames"] == 63
+    assert replay.counters["frames_published"] == 37
+
+
 @pytest.mark.parametrize(("topic", "refused"), [("tare", 1), ("electrodes", 0)])
 def test_a_recorded_message_that_does_not_decode_goes_out(topic: str, refused: int) -> None:
     replay = pipeline(live=False)

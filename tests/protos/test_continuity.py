@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.bus.continuity import SILENT_NS, Continuity
+from palpate.bus.continuity import SILENT_NS, Continuity, Holes
 from palpate.messages import Origin, Stamp
 
 PERIOD_NS = 10_000_000
@@ -269,3 +269,18 @@ def test_after_drops_of_unknown_number_a_hole_is_not_lost_on_the_bus() -> None:
     source.wait(SILENT_NS)
     source.run(60, 61)
     assert source.counters == {"dropped": 39, "lost_on_bus": 4}
+
+
+def test_holes_are_counted_by_key_whenever_their_neighbours_come() -> None:
+    holes, source = Holes(), Source()
+
+    def came(key: str, *sequences: int, session: int = A) -> list[int]:
+        stamps = [source.stamp(sequence, session) for sequence in sequences]
+        return [holes.take(key, stamp, arrived_ns=10**9, serial="S") for stamp in stamps]
+
+    assert came("a", 7, 8, 10, 11) == [0, 0, 1, 0]
+    # So many cannot have been sent meanwhile, until the next one says so, too.
+    assert came("a", 5011, 5012) == [0, 4999]
+    assert came("a", 2**40, 5013) == [0, 0]
+    assert came("b", 1, 2) == [0, 0]
+    assert holes.lost == {"a": 5000, "b": 0}

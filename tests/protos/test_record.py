@@ -105,6 +105,21 @@ def test_runs_of_a_stream_are_timed_apart(tmp_path: Path, examples: dict[str, An
     assert summary.rates_hz == pytest.approx({KEY: 100.0})
 
 
+@pytest.mark.parametrize("after_ns", [10**7, 0])
+def test_what_is_missing_of_a_stream_is_counted(
+    tmp_path: Path, examples: dict[str, Any], after_ns: int
+) -> None:
+    """Whether the record was taken live, or of a file that is played as fast as possible."""
+    frame, path = examples["ElectrodeFrame"], tmp_path / "run.mcap"
+    sequences = [*range(100, 200), *range(203, 300), *range(2704, 2800)]
+    stamps = [
+        replace(frame.stamp, sequence=k, monotonic_ns=k * 10**7, session_id=7) for k in sequences
+    ]
+    log_times_ns = [10**18 + k * after_ns for k in sequences]
+    write_times(path, stamps, log_times_ns=log_times_ns, frame=frame)
+    assert summarise(path).lost == {KEY: 3 + 2404}
+
+
 def test_a_message_that_does_not_decode_is_counted_and_not_timed(
     tmp_path: Path,
 ) -> None:

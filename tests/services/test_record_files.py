@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,33 @@ def test_each_record_holds_the_tares_that_its_frames_name(
     assert ("finger", NO_TARE) not in asked
     assert health.counters["recorded_electrodes"] == 1499
     assert health.counters["recorded_tare"] == len(records)
+
+
+def test_what_never_came_is_counted_once(
+    open_files: Any, sample: Callable[[int], TapSample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not what found no place to wait, nor what came while there was no disk."""
+    free = [10**9]
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
+    monkeypatch.setattr(writer_module, "RETRY_S", 0.0)
+    monkeypatch.setattr(writer_module, "free_bytes", lambda _: free[0])
+
+    with open_files(min_free_bytes=10**8) as (files, health):
+        for sequence in (1, 2, 5, 6):
+            files.write(sample(sequence))
+        files.write(replace(sample(9), lost_here=1))
+        files.tick()
+        assert health.counters["lost_on_bus"] == 2 + 1
+        free[0] = 10**7
+        for sequence in range(10, 20):
+            files.tick()
+            files.write(replace(sample(sequence), lost_here=1))
+        free[0] = 10**9
+        files.tick()
+        files.write(replace(sample(20), lost_here=1))
+        files.tick()
+        assert health.counters["lost_on_bus"] == 3
+        assert health.counters["lost_disk_full"] == 10
 
 
 def test_broken_payload_is_kept_and_counted(open_files: Any, tmp_path: Path) -> None:

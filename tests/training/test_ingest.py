@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -280,6 +281,48 @@ def test_a_truncated_record_is_named(record: Record) -> None:
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(RecordingError):
         ingest_record(path)
+
+
+def _later(message: Any, *, back_ns: int = 0, clock_id: int = 7, session_id: int = 0) -> Any:
+    """The message by a monotonic clock that goes back."""
+    old = message.stamp
+    new = replace(
+        old, monotonic_ns=old.monotonic_ns - back_ns, clock_id=clock_id, session_id=session_id
+    )
+    return replace(message, stamp=new)
+
+
+def _record_twice(record: Record, **later: int) -> Path:
+    """100 frames and wrenches, the latter half as ``_later`` has them."""
+    record.add(TARE, tare(1, 2000.0))
+    for topic, make in ((ELECTRODES, frame), (WRENCH, wrench)):
+        record.add(topic, *(make(i) for i in range(1, 51)))
+        record.add(topic, *(_later(make(i), **later) for i in range(51, 101)))
+    return record.write()
+
+
+def test_a_host_that_was_started_again_mixes_no_times(record: Record) -> None:
+    """Its monotonic clock began anew, so that times of before and after overlap."""
+    data = ingest_record(_record_twice(record, back_ns=30 * PERIOD_NS - 3_000_000, clock_id=8))
+    np.testing.assert_array_equal(data.electrodes[:, 0], np.arange(2001, 2000 + len(data) + 1))
+    # Each force is that in the middle of its own frame, 0.4 periods after its stamp.
+    ahead = data.force[:, 2] - np.arange(1, len(data) + 1)
+    np.testing.assert_allclose(ahead, ahead[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("session_id", [0, 5])
+def test_a_clock_that_goes_back_is_refused(record: Record, session_id: int) -> None:
+    path = _record_twice(record, back_ns=20 * PERIOD_NS, session_id=session_id)
+    with pytest.raises(DatasetError, match=r"monotonic clock of the electrodes .* back by 0.19 s"):
+        ingest_record(path)
+
+
+def test_a_frame_that_was_overtaken_is_put_in_its_place(record: Record) -> None:
+    record.add(TARE, tare(1, 2000.0))
+    record.add(ELECTRODES, *(frame(i) for i in (1, 2, 4, 3, 5)))
+    record.add(WRENCH, *(wrench(i) for i in range(1, 7)))
+    data = ingest_record(record.write())
+    np.testing.assert_array_equal(data.electrodes[:, 0], [2001, 2002, 2003, 2004, 2005])
 
 
 def test_presses_end_halfway() -> None:

@@ -54,8 +54,8 @@ def record_station(
         LinkError: There is no router, or nothing came of the station or of the sensor that is
             named; the record is there, though.
         ConfigError: An unknown topic, or no duration.
-        RecordingError: The folder cannot be made, a record was removed or moved meanwhile, or
-            messages that had arrived are not in it.
+        RecordingError: The disk has no room or the folder cannot be made; a record was removed or
+            moved meanwhile; or messages are not in it, whether they had arrived or not.
     """
     from palpate_services.config import EVERYTHING, RecorderConfig
 
@@ -64,6 +64,7 @@ def record_station(
     from palpate_services.recorder.service import SERVICE, run_recorder
 
     config = parse_config(RecorderConfig, {**EVERYTHING, **settings}, where="command line")
+    _check_room(config.out, config.min_free_bytes)
     Session.open(link, station=station).close()  # raises at once if there is no router
     before = set(config.out.glob("*.mcap"))
     stop = stop_on_signals()
@@ -81,7 +82,8 @@ def record_station(
         config, link, station, stop, instance=instance, health=health, write_all=duration_s > 0
     )
     written = sorted(set(config.out.glob("*.mcap")) - before)
-    keys = [parse_key(key) for path in written for key in print_contents(path).counts]
+    summaries = [print_contents(path) for path in written]
+    keys = [parse_key(key) for summary in summaries for key in summary.counts]
     if health.counters.get("records_gone"):
         raise RecordingError(
             "the record is not whole: its file was removed or moved while it was written, "
@@ -92,7 +94,18 @@ def record_station(
         raise RecordingError(
             f"the record is not whole: {sum(lost.values()):,} messages that had arrived are not "
             f"in it ({', '.join(lost)})",
-            remedy="relieve disk and host; record fewer topics: --topic; or no view: --no-rrd",
+            remedy=(
+                "free some space, or record to a folder on another disk: --out"
+                if "lost_disk_full" in lost
+                else "relieve disk and host; record fewer topics: --topic; or no view: --no-rrd"
+            ),
+        )
+    if missing := sum(sum(summary.lost.values()) for summary in summaries):
+        raise RecordingError(
+            f"the record is not whole: {missing:,} messages that were published never came to it "
+            "(column lost)",
+            remedy="relieve host and network, and see that nothing stops this command meanwhile; "
+            "then record again",
         )
     if config.sensor != "*" and not any(key.sensor == config.sensor for key in keys):
         raise LinkError(
@@ -102,6 +115,19 @@ def record_station(
     if all(key.sensor == own for key in keys):  # its status
         raise LinkError(
             f"nothing came of station {station!r}", remedy="see what runs: palpate status"
+        )
+
+
+def _check_room(out: Path, least: int) -> None:
+    """Refuse a disk on which the recorder would pause from its first message on."""
+    from palpate_services.recorder.writer import free_bytes
+
+    folder = out.absolute()
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if (free := free_bytes(existing)) < least:
+        raise RecordingError(
+            f"{out} has {free / 1e6:,.0f} MB free, a record needs {least / 1e6:,.0f} MB",
+            remedy="free some space, or record to a folder on another disk: --out",
         )
 
 
@@ -126,6 +152,7 @@ def show_info(path: Path, *, as_json: bool) -> None:
                 "counts": dict(summary.counts),
                 "durations_s": dict(summary.durations_s),
                 "rates_hz": dict(summary.rates_hz),
+                "lost": dict(summary.lost),
                 "wall_step_s": summary.wall_step_s,
                 "metadata": dict(summary.metadata),
             },
@@ -149,6 +176,7 @@ def print_contents(path: Path) -> RecordSummary:
     table.add_column("messages", justify="right")
     table.add_column("Hz", justify="right")
     table.add_column("length", justify="right")
+    table.add_column("lost", justify="right")
     for key, count in sorted(summary.counts.items()):
         rate, seconds = summary.rates_hz.get(key), summary.durations_s.get(key)
         table.add_row(
@@ -156,6 +184,7 @@ def print_contents(path: Path) -> RecordSummary:
             f"{count:,}",
             "-" if rate is None else f"{rate:.2f}",
             "-" if seconds is None else duration_text(seconds),
+            f"{summary.lost[key]:,}" if key in summary.lost else "-",
         )
     table.caption = f"{path.stat().st_size / 1e6:.2f} MB, from {began:%Y-%m-%d %H:%M:%S} UTC" + (
         "" if summary.complete else ", cut off: palpate recover"

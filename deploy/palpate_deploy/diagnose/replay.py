@@ -104,9 +104,22 @@ class ReplayAccount:
     @property
     def unanswered(self) -> dict[str, int]:
         """Frames that got no estimate, by the service's reason."""
-        known = {"frames_received", "estimates_published", "restarts", "delivered", "received"}
-        return {k: n for k, n in self.features.items() if n and k not in known}
+        return {k: n for k, n in self.features.items() if n and k not in _NO_REASONS}
 
+
+_NO_REASONS = frozenset(
+    {
+        "frames_received",
+        "estimates_published",
+        "restarts",
+        "delivered",
+        "received",
+        # Frames that the file lacks, so that nobody published them; those that were published and
+        # lost are the difference that is a problem.
+        "lost_on_bus",
+    }
+)
+"""Counters of the features service that do not stand for a published frame without estimate."""
 
 _DROPPED = ("late_messages", "late_wrenches", "rejected_messages")
 
@@ -232,12 +245,23 @@ def _print_problems(account: ReplayAccount) -> None:
 
 
 def replay_profile(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool) -> Profile:
-    """The profile of a replay, with its values checked."""
+    """The profile of a replay, with its values checked.
+
+    Raises:
+        PalpateError: The file cannot be played, not even its beginning.
+    """
+    from palpate_gateway.drivers import make_device
+
+    sensors = sensors_of(file)
+    for sensor in sensors:
+        # As the gateway will: an error now leaves no record without a frame behind.
+        with make_device(sensor["driver"], sensor["options"]):
+            pass
     fast = pace == "fast"
     delivery = "every" if fast else "newest"
     return private_profile(
         "replay",
-        gateway={"pace": pace, "sensors": sensors_of(file), "linger_s": _LINGER_S},
+        gateway={"pace": pace, "sensors": sensors, "linger_s": _LINGER_S},
         link={"lease_s": _LEASE_S},
         features={"bundle": bundle, "delivery": delivery, "accept_replayed": True},
         recorder={"out": str(out), "delivery": "every" if fast else "queue", "rrd": rrd},

@@ -20,6 +20,7 @@ from rich.table import Table
 
 from palpate import clock
 from palpate.bus import Delivery, ReceivedMessage, Session, TapSample
+from palpate.bus.continuity import Holes
 from palpate.bus.topics import TOPICS, Topic
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, StreamTimeout, WireError, printable
@@ -217,7 +218,7 @@ class StreamRate:
     missed: int = 0
     gaps_s: list[float] = field(default_factory=list)
     _arrival_ns: int = 0
-    _sequence: int | None = None
+    _holes: Holes = field(default_factory=Holes)
 
     def add(self, topic: Topic[object], sample: TapSample) -> None:
         """Count one sample."""
@@ -233,11 +234,10 @@ class StreamRate:
             return
         if stamp is None:
             return
-        step = stamp.sequence - (stamp.sequence - 1 if self._sequence is None else self._sequence)
-        if topic.contiguous and step > 1:
-            self.lost += step - 1
+        if topic.contiguous:
+            arrived_ns = sample.received_monotonic_ns
+            self.lost += self._holes.take(sample.key, stamp, arrived_ns=arrived_ns)
         self.missed += stamp.missed_before
-        self._sequence = stamp.sequence
 
     def summary(self) -> dict[str, float | int | None]:
         """The numbers to print; None where they need two messages and there is one."""

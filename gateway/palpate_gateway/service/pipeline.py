@@ -9,6 +9,7 @@ from concurrent.futures import Future
 from dataclasses import replace
 from math import inf
 
+from palpate.bus.continuity import Holes
 from palpate.bus.topics import ELECTRODES, TARE
 from palpate.codec import ELECTRODE_FRAME
 from palpate.codec import TARE as TARE_CODEC
@@ -77,6 +78,7 @@ class Pipeline:
         self._counts = dict.fromkeys(
             ("frames_published", "missing_frames", "frames_untared", "retares"), 0
         )
+        self._holes = Holes()
         self._info = info
         self._kind = info.sensor_type
         self.tare_frames = tare_frames
@@ -181,7 +183,7 @@ class Pipeline:
                 self._counts["missing_frames"] += item.message.stamp.missed_before
                 self._published.append((item.message, item.due_ns))
             elif isinstance(reading, RecordedMessage):
-                self._count_recorded(reading)
+                self._count_recorded(reading, arrival_ns)
                 put(item)
             else:
                 self._pass(item, put)
@@ -261,7 +263,7 @@ class Pipeline:
                 item = replace(item, message=replace(item.message, tare_id=tare_id))
             self._pass(item, put)
 
-    def _count_recorded(self, reading: RecordedMessage) -> None:
+    def _count_recorded(self, reading: RecordedMessage, arrival_ns: int) -> None:
         """A recorded message goes out as it is; its tare is kept for later requests.
 
         One that does not decode goes out as well: it was recorded so, and each consumer rejects it.
@@ -271,6 +273,9 @@ class Pipeline:
                 self._counts["frames_published"] += 1
                 frame = ELECTRODE_FRAME.decode(reading.payload)
                 self._counts["missing_frames"] += frame.stamp.missed_before
+                # Frames that its recorder never got; they are missing as well.
+                hole = self._holes.take("", frame.stamp, arrived_ns=arrival_ns)
+                self._counts["missing_frames"] += hole
                 self._counts["frames_untared"] += frame.tare_id == NO_TARE
             elif reading.topic == TARE.name:
                 self._tares.recorded(TARE_CODEC.decode(reading.payload))

@@ -222,3 +222,33 @@ class Continuity(Generic[R]):
         late = held.stamp.sequence < last.stamp.sequence
         older = held.stamp.monotonic_ns <= last.stamp.monotonic_ns
         self._counters["reordered" if late and older else "rejected_implausible"] += 1
+
+
+class Holes:
+    """Counts by key what is missing between the messages of contiguous topics that came.
+
+    For those who take every message as it comes, e.g. to record it.
+    """
+
+    def __init__(self) -> None:
+        self._sources: dict[str, tuple[Counter[str], Continuity[None]]] = {}
+
+    def take(
+        self, key: str, stamp: Stamp, *, arrived_ns: int, serial: str = "", lost_here: int = 0
+    ) -> int:
+        """How many messages a newcomer shows to be missing, e.g. 0.
+
+        ``serial``, ``arrived_ns`` and ``lost_here`` as in ``Continuity.take``.
+        """
+        if key not in self._sources:
+            new: Counter[str] = Counter()
+            self._sources[key] = new, Continuity(new, contiguous=True)
+        counters, continuity = self._sources[key]
+        before = counters["lost_on_bus"]
+        continuity.take(None, stamp, serial=serial, arrived_ns=arrived_ns, lost_here=lost_here)
+        return counters["lost_on_bus"] - before
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """How many are missing, by key; 0 = none between those that came."""
+        return {key: counters["lost_on_bus"] for key, (counters, _) in self._sources.items()}

@@ -29,6 +29,8 @@ class TapSample:
     payload: bytes
     received_monotonic_ns: int
     received_wall_ns: int
+    lost_here: int = 0
+    """Samples of this key that found no place to wait, in all before it."""
 
     @property
     def schema(self) -> str:
@@ -86,7 +88,7 @@ class Tap(Closing):
                 raise StreamTimeout(
                     f"no message within {timeout_s:g} s", remedy="check what runs: palpate status"
                 )
-            sample, monotonic_ns, wall_ns = item[0]
+            (sample, monotonic_ns, wall_ns), lost_here = item
             key = str(sample.key_expr)
             try:
                 address = parse_key(key)
@@ -102,6 +104,7 @@ class Tap(Closing):
                 sample.payload.to_bytes(),
                 monotonic_ns,
                 wall_ns,
+                lost_here,
             )
 
     def close(self) -> None:

@@ -14,7 +14,9 @@ from typing import Any
 from google.protobuf.message import DecodeError
 from mcap.records import Channel, Metadata, Schema
 
-from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, StreamAddress, parse_key
+from palpate.bus.continuity import Holes
+from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, TOPICS, StreamAddress, parse_key
+from palpate.codec.base import stamp_from_wire
 from palpate.errors import ConfigError, RecordingError, WireError, printable
 from palpate.files.bounded import open_regular
 from palpate.files.mcap_stream import (
@@ -216,6 +218,8 @@ class RecordSummary:
         durations_s: From the first to the last message by key, by the monotonic clock that stamped
             them [s]; a key without such stamps is missing.
         rates_hz: Messages a second by key, by the same clock [Hz]; missing = not known.
+        lost: How many messages are missing between those that are there, by their sequence numbers,
+            by key of a contiguous topic.
         wall_step_s: By how much the wall clock was set meanwhile, the largest time [s]; 0 = it was
             not.
         start_wall_ns: First log time [ns].
@@ -227,6 +231,7 @@ class RecordSummary:
     counts: Mapping[str, int] = field(default_factory=dict)
     durations_s: Mapping[str, float] = field(default_factory=dict)
     rates_hz: Mapping[str, float] = field(default_factory=dict)
+    lost: Mapping[str, int] = field(default_factory=dict)
     wall_step_s: float = 0.0
     start_wall_ns: int = 0
     end_wall_ns: int = 0
@@ -241,27 +246,28 @@ def summarise(path: Path) -> RecordSummary:
     """
     complete = path.suffix != ".part"
     counts: Counter[str] = Counter()
-    times = _StampTimes()
+    stamps = _Stamps()
     start = end = 0
     for item in read_record(path, allow_partial=not complete):
         counts[item.key] += 1
-        times.take(item)
+        stamps.take(item)
         start = start or item.log_time_ns
         end = item.log_time_ns
     return RecordSummary(
         metadata_of(path),
         counts,
-        {key: 1e-9 * span for key, span in times.spans_ns.items()},
-        {key: 1e9 * times.intervals[key] / span for key, span in times.spans_ns.items() if span},
-        1e-9 * times.wall_step_ns,
+        {key: 1e-9 * span for key, span in stamps.spans_ns.items()},
+        {key: 1e9 * stamps.intervals[key] / span for key, span in stamps.spans_ns.items() if span},
+        stamps.holes.lost,
+        1e-9 * stamps.wall_step_ns,
         start,
         end,
         complete,
     )
 
 
-class _StampTimes:
-    """How long streams are, by the monotonic stamps of their messages.
+class _Stamps:
+    """How long and how whole streams are, by the stamps of their messages.
 
     Log times are of a wall clock, which may be set, and of arrival, which a busy host delays.
 
@@ -269,12 +275,14 @@ class _StampTimes:
         spans_ns: Time between messages that follow one another, summed by key [ns].
         intervals: How many such pairs there are, by key.
         wall_step_ns: The largest step of the wall clock against the stamps [ns].
+        holes: What is missing of contiguous topics.
     """
 
     def __init__(self) -> None:
         self.spans_ns: Counter[str] = Counter()
         self.intervals: Counter[str] = Counter()
         self.wall_step_ns = 0
+        self.holes = Holes()
         self._last: dict[tuple[str, int], tuple[int, int]] = {}
 
     def take(self, item: RecordItem) -> None:
@@ -287,6 +295,10 @@ class _StampTimes:
         # A status and a robot's pose have no stamp, but times of one clock.
         clock_id = getattr(stamp, "clock_id", getattr(stamp, "run_id", 0))
         now_ns = getattr(stamp, "monotonic_ns", getattr(stamp, "time_ns", 0))
+        topic = TOPICS.get(item.address.topic)
+        if topic is not None and topic.contiguous and topic.codec.schema == item.schema:
+            with contextlib.suppress(WireError):
+                self.holes.take(item.key, stamp_from_wire(stamp), arrived_ns=item.log_time_ns)
         if not now_ns:
             return
         stream = item.key, clock_id

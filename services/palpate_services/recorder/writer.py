@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.bus import TapSample
+from palpate.bus.continuity import Holes
 from palpate.bus.topics import FIELD, FIELD_TRUTH, TARE, TOPICS, Topic, sensor_key
 from palpate.errors import ErrorCode, RecordingError, WireError
 from palpate.files.record import Recovery, is_being_written, recover
@@ -58,8 +59,8 @@ def disk_error(folder: Path, why: str) -> DiskError:
         left = "free space unknown"
     return DiskError(
         f"recording to {folder} is paused: {why} ({left})",
-        remedy="free some space, see that the folder may be written, or change recorder.out; "
-        "recording resumes by itself",
+        remedy="free some space, and see that the folder may be written: recording resumes by "
+        "itself; or record elsewhere: recorder.out, or --out of `palpate record`",
     )
 
 
@@ -220,6 +221,7 @@ class RecordFiles:
         MeshLibrary(config.bundles)  # raises for one that is missing, which a view would only log
         self._retention = retention.Retention(config, station, health)
         self._kept_s = float("-inf")
+        self._holes = Holes()
         self._field_rate = RateLimit(config.field_rate_hz or None)
 
     def start(self) -> None:
@@ -238,13 +240,18 @@ class RecordFiles:
         except OSError as error:
             raise RecordingError(
                 f"recorder.out = {self._config.out}: {error.strerror}",
-                remedy="set recorder.out to a folder this user may write to",
+                remedy="name a folder that this user may write to: recorder.out, or --out of "
+                "`palpate record`",
             ) from error
 
     def write(self, sample: TapSample) -> None:
-        """Record one sample; without a disk to write to it is counted as ``lost_disk_full``."""
+        """Record one sample; without a disk to write to it is counted as ``lost_disk_full``.
+
+        Those that never came are counted as ``lost_on_bus``.
+        """
         if self._writer is None:
             self._counts["lost_disk_full"] += 1
+            self._holes = Holes()  # what is missing when it goes on is counted already
             return
         topic = TOPICS.get(sample.topic)
         if topic is None or topic.codec.schema != sample.schema:
@@ -252,6 +259,12 @@ class RecordFiles:
             return
         message = self._decode(topic, sample)
         stamp = None if message is None else topic.stamp_of(message)
+        if stamp is not None and topic.contiguous:
+            arrived_ns, lost_here = sample.received_monotonic_ns, sample.lost_here
+            if hole := self._holes.take(
+                sample.key, stamp, arrived_ns=arrived_ns, lost_here=lost_here
+            ):
+                self._counts["lost_on_bus"] += hole
         if isinstance(message, Tare):
             self._tares.add((sample.sensor, message.tare_id))
         elif isinstance(message, ElectrodeFrame):

@@ -15,6 +15,7 @@ changes neither magnitudes nor angles.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import re
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate import __version__
-from palpate.alignment import linear
+from palpate.alignment import AlignmentClock, Stamped, common_clock, linear, times_of
 from palpate.bus import topics
 from palpate.errors import DatasetError
 from palpate.files.record import read_record
@@ -61,6 +62,11 @@ class SensorStreams:
     poses: list[IndenterPoseFrame] = field(default_factory=list)
     tares: dict[int, Tare] = field(default_factory=dict)
 
+    @property
+    def clock(self) -> AlignmentClock:
+        """By which all its messages can be compared."""
+        return common_clock(self.frames, self.wrenches, self.poses)
+
 
 def ingest_record(path: Path, *, command: str = "", licence: str = "own record") -> FeatureDataset:
     """Read an MCAP record.
@@ -78,8 +84,8 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
 
     Raises:
         RecordingError: Not a whole record.
-        DatasetError: The record lacks a stream, no row could be aligned, or a sensor is no BioTac
-            with 19 electrodes.
+        DatasetError: The record lacks a stream, no row could be aligned, a sensor is no BioTac with
+            19 electrodes, or its clock goes back.
     """
     return rows_of_streams(path, read_streams(path), command=command, licence=licence)
 
@@ -180,21 +186,20 @@ def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArr
             " frame",
             remedy="tare before recording, and record the stream tare",
         )
-    times = times_of(frames, streams)
+    clock = streams.clock
+    times = times_of(frames, clock)
     order = np.argsort(times, kind="stable")
     frames, times = [frames[i] for i in order], times[order]
     at = times + middles(frames)
 
-    force, kept = force_at(at, streams)
+    force, kept = force_at(at, streams, clock)
     location = None
     touching = np.linalg.norm(force, axis=1) > TOUCH_N
     if streams.poses:
         positions = np.array([p.position for p in streams.poses], dtype=np.float64)
         # NaN = not known, and so is what lies between a known and an unknown one
         contact = np.array([[p.in_contact] for p in streams.poses], dtype=np.float64)
-        both, has_pose = linear(
-            at, times_of(streams.poses, streams), np.hstack([positions, contact])
-        )
+        both, has_pose = linear(at, times_of(streams.poses, clock), np.hstack([positions, contact]))
         location = both[:, :3]
         touching = np.where(np.isnan(both[:, 3]), touching, both[:, 3] >= 0.5)
         kept = kept & has_pose
@@ -221,7 +226,7 @@ def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArr
 
 
 def check_streams(path: Path, name: str, streams: SensorStreams) -> None:
-    """Refuse a sensor without a wrench, or with other electrodes than a data set has.
+    """Refuse a sensor without a wrench, with other electrodes than a data set has, or times twice.
 
     Raises:
         DatasetError: It is such; no frame is left out in silence.
@@ -239,25 +244,42 @@ def check_streams(path: Path, name: str, streams: SensorStreams) -> None:
             f"{SensorType.BIOTAC.layout.electrodes}",
             remedy="record BioTacs with 19 electrodes alone; models are trained for no other",
         )
+    clock = streams.clock
+    _check_times(path, name, streams.frames, clock, "electrodes")
+    _check_times(path, name, streams.wrenches, clock, "wrench")
+    _check_times(path, name, streams.poses, clock, "pose")
 
 
-def times_of(
-    frames: Sequence[ElectrodeFrame | WrenchFrame | IndenterPoseFrame], streams: SensorStreams
-) -> Times:
-    """Monotonic times [ns] where the streams' first readings share the clock, else wall times."""
-    shared = all(
-        stamps[0].stamp.clock_id == streams.frames[0].stamp.clock_id
-        for stamps in (streams.wrenches, streams.poses)
-        if stamps
-    )
-    stamps = [frame.stamp for frame in frames]
-    return np.array([s.monotonic_ns if shared else s.wall_ns for s in stamps], dtype=np.int64)
+def _check_times(
+    path: Path, name: str, stream: Sequence[Stamped], clock: AlignmentClock, what: str
+) -> None:
+    """Refuse a stream whose clock went back, so that some of its times come twice."""
+    stamps = [message.stamp for message in stream]
+    times = times_of(stream, clock)
+    pairs = zip(itertools.pairwise(stamps), np.diff(times) < 0, strict=True)
+    # What was overtaken on the bus, or is played again, goes back in its sequence as well.
+    set_back = [
+        earlier and not (new.session_id == old.session_id and new.sequence < old.sequence)
+        for (old, new), earlier in pairs
+    ]
+    parts = np.cumsum([False, *set_back])
+    in_time = parts[np.argsort(times, kind="stable")]
+    if np.count_nonzero(np.diff(in_time)) > parts[-1]:
+        at = set_back.index(True)
+        back_s = (times[at] - times[at + 1]) * 1e-9
+        raise DatasetError(
+            f"{path}: the {clock.value} clock of the {what} of {name!r} goes back by {back_s:.2f} "
+            "s: some times come twice, and what belongs together is unknown",
+            remedy="record again, and leave the clocks alone meanwhile (docs/time.md)",
+        )
 
 
-def force_at(times: Times, streams: SensorStreams) -> tuple[Values, npt.NDArray[np.bool_]]:
-    """Force at times [N], shape (T, 3), and where it is known."""
+def force_at(
+    times: Times, streams: SensorStreams, clock: AlignmentClock
+) -> tuple[Values, npt.NDArray[np.bool_]]:
+    """Force at times of a clock [N], shape (T, 3), and where it is known."""
     forces = np.array([w.force for w in streams.wrenches], dtype=np.float64)
-    return linear(times, times_of(streams.wrenches, streams), forces)
+    return linear(times, times_of(streams.wrenches, clock), forces)
 
 
 def middles(frames: Sequence[ElectrodeFrame]) -> Times:

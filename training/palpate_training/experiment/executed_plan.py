@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from palpate.alignment import linear
+from palpate.alignment import linear, times_of
 from palpate.errors import ConfigError, DatasetError
 from palpate.rigid import Floats, Transform
 from palpate_training.datasets.container import csv_rows
@@ -27,7 +27,6 @@ from palpate_training.datasets.ingest import (
     force_at,
     middles,
     read_streams,
-    times_of,
 )
 from palpate_training.datasets.trials import RawTrial, TrialHeader
 from palpate_training.experiment.kinematics import ArmKinematics
@@ -123,10 +122,11 @@ def _samples(record: Path, sensor: str, streams: SensorStreams) -> _AlignedSampl
             f"{record}: sensor {sensor!r} has no valid BioTac frame",
             remedy="record the stream electrodes of the finger",
         )
-    times, first = np.unique(times_of(frames, streams), return_index=True)
+    clock = streams.clock
+    times, first = np.unique(times_of(frames, clock), return_index=True)
     frames = [frames[i] for i in first]
     at = times + middles(frames)
-    force, known = force_at(at, streams)
+    force, known = force_at(at, streams, clock)
     walls = np.array([frame.stamp.wall_ns for frame in frames], dtype=np.int64)
     return _AlignedSamples(
         at[known],
@@ -146,7 +146,7 @@ def _tip_of_poses(
         )
     return linear(
         samples.time_ns,
-        times_of(streams.poses, streams),
+        times_of(streams.poses, streams.clock),
         np.array([p.position for p in streams.poses], dtype=np.float64),
     )
 
