@@ -19,9 +19,12 @@ from rich.console import Console
 
 from palpate.bus import Session
 from palpate.census import ProcessReport
+from palpate.codec import STATUS
 from palpate.config import LinkConfig
 from palpate.health import Health, HealthReporter
 from palpate.messages import (
+    GAUGE_MAX,
+    UPTIME_MAX_S,
     SensorState,
     SensorStatus,
     ServiceState,
@@ -31,8 +34,9 @@ from palpate.messages import (
 from palpate_deploy.station import observation
 from palpate_deploy.station.activity import DropCount, process_activities, sensor_activities
 from palpate_deploy.station.observation import ObservedProcess, StationObserver
-from palpate_deploy.station.status import shown_counters
-from palpate_deploy.station.top import run_top, screen
+from palpate_deploy.station.status import _print, shown_counters
+from palpate_deploy.station.top import _as_json, run_top, screen
+from palpate_deploy.station.web.snapshot import snapshot
 from palpate_services.inference.estimates import EstimateRefusal
 
 PATIENCE_S = 20.0
@@ -185,6 +189,29 @@ def test_the_picture_shows_all_of_it(width: int) -> None:
     ):
         assert words in everything
     assert ("features-twin:1" in everything) == (width > 100)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_largest_numbers_that_a_status_may_hold_are_shown(sign: float) -> None:
+    numbers = sign * GAUGE_MAX
+    names = {"clock_quality", "clock_drift_ppm", "wall_synchronised", "wall_error_s", "tare_age_s"}
+    seen = []
+    for one in observed():
+        if (status := one.report.status) is not None:
+            status = dataclasses.replace(
+                status,
+                uptime_s=UPTIME_MAX_S,
+                counters=dict.fromkeys(status.counters, 2**64 - 1),
+                gauges=dict.fromkeys([*status.gauges, *names], numbers),
+            )
+            status = STATUS.decode(STATUS.encode(status))
+        report = dataclasses.replace(one.report, status=status)
+        seen.append(dataclasses.replace(one, report=report))
+    console = Console(file=io.StringIO(), width=160)
+    console.print(screen("lab", seen, 160))
+    _print(console, "lab", "", [one.report for one in seen], [])
+    for value in (_as_json("lab", seen), snapshot("lab", seen, router=True, own=("web", "web"))):
+        json.dumps(value, allow_nan=False)
 
 
 def test_rates_are_of_the_last_seconds_and_forget_a_restart() -> None:

@@ -52,6 +52,8 @@ from palpate.messages.requests import (
     SynthesisRequest,
 )
 from palpate.messages.service import (
+    GAUGE_MAX,
+    UPTIME_MAX_S,
     ChannelFault,
     ErrorReply,
     FaultKind,
@@ -67,6 +69,7 @@ from palpate.messages.service import (
     TensorInfo,
     WrenchZero,
     WrenchZeroRequest,
+    is_gauge,
 )
 from palpate.messages.simulation import (
     SimulationCancelReply,
@@ -85,8 +88,10 @@ __all__ = [
     "BIOTAC_LAYOUT",
     "BIOTAC_SP_LAYOUT",
     "COUNTS_MAX",
+    "GAUGE_MAX",
     "NO_TARE",
     "PAC_SAMPLES",
+    "UPTIME_MAX_S",
     "BasisRequest",
     "ChannelFault",
     "ContactDescription",
@@ -146,4 +151,5 @@ __all__ = [
     "WrenchZero",
     "WrenchZeroRequest",
     "as_field_frame",
+    "is_gauge",
 ]
