@@ -91,6 +91,7 @@ SUPERVISOR = Status(
         SupervisedProcess("features", "features", "running", 4711, 2, 60.0),
         SupervisedProcess("router", "router", "running", 4700, 0, 60.0),
         SupervisedProcess("fem", "fem", "backoff", 0, 7, 0.0),
+        SupervisedProcess("synthesis", "synthesis", "running", 4712, 1, 60.0),
     ),
 )
 
@@ -109,11 +110,12 @@ def observed() -> list[ObservedProcess]:
         ObservedProcess(ProcessReport("fem", "fem", False, False, None)),
         ObservedProcess(ProcessReport("field", "field", True, True, None)),
         ObservedProcess(ProcessReport("router", "router", True, True, None)),
+        ObservedProcess(ProcessReport("synthesis", "synthesis", False, False, None)),
     ]
 
 
 def test_figures_of_every_process() -> None:
-    features, gateway, _, fem, field, router = process_activities(observed())
+    features, gateway, _, fem, field, router, hung = process_activities(observed())
     assert (features.in_hz, features.out_hz) == (100.0, 100.0)
     assert features.latencies["latency"].p99_s == 3.4e-3
     assert features.latencies["infer"].p50_s == 4e-4
@@ -124,6 +126,7 @@ def test_figures_of_every_process() -> None:
     assert (gateway.out_hz, gateway.drops) == (200.0, {})
     assert (fem.state, fem.restarts) == ("backoff", 7)
     assert (field.state, field.in_hz) == ("silent", None)
+    assert (hung.state, hung.pid, hung.restarts) == ("silent", 4712, 1)
     assert (router.state, router.uses.rss_bytes, router.pid) == ("routes", 7e7, 4700)
 
 
@@ -186,6 +189,8 @@ def test_the_picture_shows_all_of_it(width: int) -> None:
         "thumb lost: silences 3",
         "field: lives and does not answer",
         "fem: does not serve: its supervisor says backoff, started again 7 times",
+        "synthesis silent",
+        "synthesis: runs and cannot be reached",
     ):
         assert words in everything
     assert ("features-twin:1" in everything) == (width > 100)
