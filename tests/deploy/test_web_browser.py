@@ -65,7 +65,7 @@ def test_a_person_sees_a_station_that_runs_and_is_told_when_it_does_not(
     said, kind = browser.evaluate(
         f"(show({status}), [at('alarm').textContent, document.body.className])"
     )
-    assert said.startswith("What is below still comes, but its router is gone.")
+    assert said.startswith("What is below still comes, but the router is gone.")
     assert "old" not in kind
     station.stop()
     wait_until(lambda: "does not answer" in text(browser, "alarm"), PATIENCE_S, "it is told")

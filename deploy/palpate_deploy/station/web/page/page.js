@@ -74,7 +74,7 @@ function show(status) {
   whole.textContent = `${well} of ${status.processes.length} processes well${wrong ? `, ${wrong} wrong` : ""}`;
   whole.className = `word ${wrong ? "bad" : "good"}`;
   at("live").hidden = !status.live;
-  const gone = "its router is gone. It starts again by itself, or with: palpate up";
+  const gone = "the router is gone. It starts again by itself, or with: palpate up";
   const nobody = "The station does not answer: its router is there, but no process of it. Start it with: palpate up";
   if (status.answers) alarm(status.router ? "" : `What is below still comes, but ${gone}`, false);
   else alarm(status.router ? nobody : `The station does not answer: ${gone}`);
