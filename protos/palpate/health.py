@@ -20,6 +20,7 @@ from palpate.bus.queryable import error_reply
 from palpate.bus.topics import STATUS as STATUS_TOPIC
 from palpate.errors import PalpateError
 from palpate.messages import (
+    GAUGE_MAX,
     ChannelFault,
     ErrorReply,
     SensorState,
@@ -27,7 +28,6 @@ from palpate.messages import (
     ServiceState,
     Status,
     SupervisedProcess,
-    is_gauge,
 )
 from palpate.process import Closing, ProcessUsage
 
@@ -144,7 +144,7 @@ class Health:
     def gauge(self, name: str, value: float) -> None:
         """Set a gauge; its name ends in the unit.
 
-        A value that is none (``is_gauge``), e.g. NaN, takes the gauge away and is counted as
+        A value beyond ``GAUGE_MAX``, or NaN, takes the gauge away and is counted as
         ``gauges_not_finite``.
         """
         with self._lock:
@@ -161,7 +161,7 @@ class Health:
     def _set_gauges(self, gauges: Mapping[str, float]) -> None:
         """Take over gauges; the caller holds the lock."""
         for name, value in gauges.items():
-            if is_gauge(value):
+            if abs(value) <= GAUGE_MAX:  # NaN is not
                 self._gauges[name] = value
                 continue
             self._gauges.pop(name, None)

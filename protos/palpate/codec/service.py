@@ -43,7 +43,6 @@ from palpate.messages import (
     ValueRange,
     WrenchZero,
     WrenchZeroRequest,
-    is_gauge,
 )
 from palpate.v1 import service_pb2
 
@@ -251,7 +250,7 @@ def _status_from_wire(msg: service_pb2.Status) -> Status:
         msg.version,
         dict(msg.counters),
         # Not refused: all else that the process says of itself is still to be known.
-        {name: value for name, value in msg.gauges.items() if is_gauge(value)},
+        {name: value for name, value in msg.gauges.items() if abs(value) <= GAUGE_MAX},
         tuple(msg.sensors),
         _check_text(msg.message, "message"),
         _error_from_wire(msg.last_error) if msg.HasField("last_error") else None,
@@ -263,7 +262,7 @@ def _status_from_wire(msg: service_pb2.Status) -> Status:
 
 def _status_encode(status: Status) -> bytes:
     for name, value in status.gauges.items():
-        if not is_gauge(value):
+        if not abs(value) <= GAUGE_MAX:  # NaN is refused, too
             reject("gauge", f"gauge {name!r} = {value} is not in [-{GAUGE_MAX:g}, {GAUGE_MAX:g}]")
     for name, count in status.counters.items():
         if not 0 <= count <= _COUNT_MAX:

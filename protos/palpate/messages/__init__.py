@@ -69,7 +69,6 @@ from palpate.messages.service import (
     TensorInfo,
     WrenchZero,
     WrenchZeroRequest,
-    is_gauge,
 )
 from palpate.messages.simulation import (
     SimulationCancelReply,
@@ -151,5 +150,4 @@ __all__ = [
     "WrenchZero",
     "WrenchZeroRequest",
     "as_field_frame",
-    "is_gauge",
 ]

@@ -192,11 +192,6 @@ UPTIME_MAX_S = 1e10
 """Longest uptime [s]: 300 years, as in int64 nanoseconds."""
 
 
-def is_gauge(value: float) -> bool:
-    """Whether a value may be a gauge: a finite number of at most ``GAUGE_MAX``."""
-    return abs(value) <= GAUGE_MAX  # NaN is not
-
-
 @dataclass(frozen=True, slots=True)
 class Status:
     """State and counters of a process: sent each second, on a change of state, and when asked.
@@ -209,7 +204,7 @@ class Status:
         uptime_s: Since the process was ready to count [s].
         version: Version of palpate.
         counters: Events since the start.
-        gauges: Present values, see ``is_gauge``; the name ends in the unit.
+        gauges: Present values, at most ``GAUGE_MAX``; the name ends in the unit.
         sensors: Sensors it serves.
         message: One line for people.
         sensor_states: Of a gateway: each of its sensors.
