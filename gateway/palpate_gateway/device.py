@@ -20,7 +20,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import ClassVar, Self
+from typing import Annotated, ClassVar, Self
+
+from pydantic import AfterValidator
 
 from palpate.config import LinkConfig, StrictConfig
 from palpate.errors import DeviceError, RecordingError
@@ -76,6 +78,16 @@ class DeviceIdentity:
 
 SERIAL_MAX = 64
 """Longest serial number of a frame [characters]."""
+
+
+def _check_given(serial: str) -> str:
+    if serial and _fit_for_wire(serial) != serial:
+        raise ValueError(f"a serial number has 1 to {SERIAL_MAX} printable ASCII characters")
+    return serial
+
+
+SerialOption = Annotated[str, AfterValidator(_check_given)]
+"""A serial number given by a user, refused if a frame cannot carry it unchanged; empty = none."""
 
 
 def _fit_for_wire(name: str) -> str:

@@ -20,6 +20,7 @@ from palpate.bus.queryable import error_reply
 from palpate.bus.topics import STATUS as STATUS_TOPIC
 from palpate.errors import PalpateError
 from palpate.messages import (
+    GAUGE_MAX,
     ChannelFault,
     ErrorReply,
     SensorState,
@@ -69,6 +70,7 @@ class Health:
         self._counters: Counter[str] = Counter()
         self._gauges: dict[str, float] = {}
         self._sources: dict[str, frozenset[str]] = {}
+        self._odd_gauges: set[str] = set()
         self._state = ServiceState.STARTING
         self._message = self._state_message = ""
         self._last_error: ErrorReply | None = None
@@ -140,9 +142,13 @@ class Health:
             self._counters.update({k: v - self._counters[k] for k, v in counts.items()})
 
     def gauge(self, name: str, value: float) -> None:
-        """Set a gauge; its name ends in the unit."""
+        """Set a gauge; its name ends in the unit.
+
+        A value beyond ``GAUGE_MAX``, or NaN, takes the gauge away and is counted as
+        ``gauges_not_finite``.
+        """
         with self._lock:
-            self._gauges[name] = value
+            self._set_gauges({name: value})
 
     def set_gauges(self, source: str, gauges: Mapping[str, float]) -> None:
         """Set all gauges of a source, e.g. a sensor; those that it had and has no more are gone."""
@@ -150,7 +156,19 @@ class Health:
             for name in self._sources.get(source, frozenset()) - gauges.keys():
                 self._gauges.pop(name, None)
             self._sources[source] = frozenset(gauges)
-            self._gauges.update(gauges)
+            self._set_gauges(gauges)
+
+    def _set_gauges(self, gauges: Mapping[str, float]) -> None:
+        """Take over gauges; the caller holds the lock."""
+        for name, value in gauges.items():
+            if abs(value) <= GAUGE_MAX:  # NaN is not
+                self._gauges[name] = value
+                continue
+            self._gauges.pop(name, None)
+            self._counters["gauges_not_finite"] += 1
+            if name not in self._odd_gauges:
+                self._odd_gauges.add(name)
+                _log.warning("gauge %s = %s measures nothing and is left out", name, value)
 
     def fail(self, error: PalpateError, *, degraded: bool = True) -> None:
         """Remember the last error; by default the state becomes DEGRADED."""

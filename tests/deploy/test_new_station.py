@@ -230,6 +230,34 @@ class TestNothingIsWritten:
         assert said in done.output
         assert not list(lab.iterdir())
 
+    @pytest.mark.parametrize("variable", ["", '["tcp/127.0.0.1:7449"]'])
+    @pytest.mark.parametrize(
+        ("listen", "said"),
+        [
+            ("nonsense", "is not tcp/HOST:PORT"),
+            ("tcp/0.0.0.0:7448", "without mutual TLS"),
+            ("tcp/127.0.0.1:0", "no port that others could know"),
+        ],
+    )
+    def test_of_an_address_that_no_router_would_take(
+        self, lab: Path, monkeypatch: pytest.MonkeyPatch, variable: str, listen: str, said: str
+    ) -> None:
+        """The profile outlives a variable that would hide what it says."""
+        if variable:
+            monkeypatch.setenv("PALPATE_ROUTER__LISTEN", variable)
+        done = run("--biotac", VIRTUAL, "--listen", listen)
+        assert done.exit_code == USAGE
+        assert said in done.output
+        assert "is read for" not in done.output, "it is refused before any device is tried"
+        assert not list(lab.iterdir())
+
+    @pytest.mark.parametrize("serial", ["ünï çode", "x" * 65, "a\nb"])
+    def test_of_a_serial_number_that_would_be_changed(self, lab: Path, serial: str) -> None:
+        done = run("--biotac", VIRTUAL, "--serial", serial)
+        assert done.exit_code == USAGE
+        assert "serial" in done.output
+        assert not list(lab.iterdir())
+
     def test_where_there_is_no_folder(self, lab: Path) -> None:
         done = run("--biotac", VIRTUAL, "--out", "nowhere/lab.toml")
         assert done.exit_code == USAGE
@@ -273,6 +301,8 @@ class TestAProfileThatIsThere:
             (("--wrench", "wrench_kms40 host=10.0.0.7"), "no sensor 'wrench'"),
             (("--name", "right", "--out", "lab.toml"), "station 'lab'"),
             (("--biotac", VIRTUAL, "--serial", "BT02"), "'finger' with serial = None"),
+            (("--serial", "BT02"), "'finger' with serial = None"),
+            (("--listen", "tcp/127.0.0.1:7448"), "a router that listens at tcp/127.0.0.1:7447"),
         ],
     )
     def test_of_other_devices_is_not_written_over(
@@ -284,6 +314,13 @@ class TestAProfileThatIsThere:
         assert done.exit_code == USAGE
         assert said in done.output
         assert (lab / "lab.toml").read_bytes() == before
+
+    def test_is_compared_as_it_is_written(self, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        listen = ("--listen", "tcp/127.0.0.1:7448", "--serial", "BT02")
+        assert run("--biotac", VIRTUAL, *listen).exit_code == OK
+        monkeypatch.setenv("PALPATE_ROUTER__LISTEN", '["tcp/127.0.0.1:7449"]')
+        assert run(*listen).exit_code == OK
+        assert run("--listen", "tcp/127.0.0.1:7449").exit_code == USAGE
 
     def test_that_appears_meanwhile_is_not_written_over(self, lab: Path) -> None:
         path = lab / "lab.toml"

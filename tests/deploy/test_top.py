@@ -19,9 +19,12 @@ from rich.console import Console
 
 from palpate.bus import Session
 from palpate.census import ProcessReport
+from palpate.codec import STATUS
 from palpate.config import LinkConfig
 from palpate.health import Health, HealthReporter
 from palpate.messages import (
+    GAUGE_MAX,
+    UPTIME_MAX_S,
     SensorState,
     SensorStatus,
     ServiceState,
@@ -31,8 +34,9 @@ from palpate.messages import (
 from palpate_deploy.station import observation
 from palpate_deploy.station.activity import DropCount, process_activities, sensor_activities
 from palpate_deploy.station.observation import ObservedProcess, StationObserver
-from palpate_deploy.station.status import shown_counters
-from palpate_deploy.station.top import run_top, screen
+from palpate_deploy.station.status import _print, shown_counters
+from palpate_deploy.station.top import _as_json, run_top, screen
+from palpate_deploy.station.web.snapshot import snapshot
 from palpate_services.inference.estimates import EstimateRefusal
 
 PATIENCE_S = 20.0
@@ -87,6 +91,7 @@ SUPERVISOR = Status(
         SupervisedProcess("features", "features", "running", 4711, 2, 60.0),
         SupervisedProcess("router", "router", "running", 4700, 0, 60.0),
         SupervisedProcess("fem", "fem", "backoff", 0, 7, 0.0),
+        SupervisedProcess("synthesis", "synthesis", "running", 4712, 1, 60.0),
     ),
 )
 
@@ -105,11 +110,12 @@ def observed() -> list[ObservedProcess]:
         ObservedProcess(ProcessReport("fem", "fem", False, False, None)),
         ObservedProcess(ProcessReport("field", "field", True, True, None)),
         ObservedProcess(ProcessReport("router", "router", True, True, None)),
+        ObservedProcess(ProcessReport("synthesis", "synthesis", False, False, None)),
     ]
 
 
 def test_figures_of_every_process() -> None:
-    features, gateway, _, fem, field, router = process_activities(observed())
+    features, gateway, _, fem, field, router, hung = process_activities(observed())
     assert (features.in_hz, features.out_hz) == (100.0, 100.0)
     assert features.latencies["latency"].p99_s == 3.4e-3
     assert features.latencies["infer"].p50_s == 4e-4
@@ -120,6 +126,7 @@ def test_figures_of_every_process() -> None:
     assert (gateway.out_hz, gateway.drops) == (200.0, {})
     assert (fem.state, fem.restarts) == ("backoff", 7)
     assert (field.state, field.in_hz) == ("silent", None)
+    assert (hung.state, hung.pid, hung.restarts) == ("silent", 4712, 1)
     assert (router.state, router.uses.rss_bytes, router.pid) == ("routes", 7e7, 4700)
 
 
@@ -182,9 +189,34 @@ def test_the_picture_shows_all_of_it(width: int) -> None:
         "thumb lost: silences 3",
         "field: lives and does not answer",
         "fem: does not serve: its supervisor says backoff, started again 7 times",
+        "synthesis silent",
+        "synthesis: runs and cannot be reached",
     ):
         assert words in everything
     assert ("features-twin:1" in everything) == (width > 100)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_largest_numbers_that_a_status_may_hold_are_shown(sign: float) -> None:
+    numbers = sign * GAUGE_MAX
+    names = {"clock_quality", "clock_drift_ppm", "wall_synchronised", "wall_error_s", "tare_age_s"}
+    seen = []
+    for one in observed():
+        if (status := one.report.status) is not None:
+            status = dataclasses.replace(
+                status,
+                uptime_s=UPTIME_MAX_S,
+                counters=dict.fromkeys(status.counters, 2**64 - 1),
+                gauges=dict.fromkeys([*status.gauges, *names], numbers),
+            )
+            status = STATUS.decode(STATUS.encode(status))
+        report = dataclasses.replace(one.report, status=status)
+        seen.append(dataclasses.replace(one, report=report))
+    console = Console(file=io.StringIO(), width=160)
+    console.print(screen("lab", seen, 160))
+    _print(console, "lab", "", [one.report for one in seen], [])
+    for value in (_as_json("lab", seen), snapshot("lab", seen, router=True, own=("web", "web"))):
+        json.dumps(value, allow_nan=False)
 
 
 def test_rates_are_of_the_last_seconds_and_forget_a_restart() -> None:

@@ -108,7 +108,10 @@ def test_a_station_answers_only_if_a_process_beside_the_page_does() -> None:
     page = dataclasses.replace(RECORDER, service="web", instance="web")
     assert seen(GATEWAY, page)["answers"]
     assert not seen(page)["answers"]
-    assert not seen(GATEWAY, router=False)["answers"]
+    unrouted = seen(GATEWAY, page, router=False)
+    assert unrouted["answers"], "what comes by direct links is as it is now"
+    assert not unrouted["router"]
+    assert not seen(page, router=False)["answers"]
     silent = seen(GATEWAY, up=False)
     assert not silent["answers"]
     assert silent["troubles"][0]["problem"] == "does not run"
@@ -358,6 +361,35 @@ def test_a_station_is_shown_while_it_runs_and_said_to_be_gone_afterwards(
         reporter.close()
         presence.close()
         wait_until(lambda: not status()["answers"], PATIENCE_S, "the page says that it is gone")
+
+
+def test_nobody_is_shown_as_silent_before_it_could_tell(
+    link: LinkConfig, free_port: int, wait_until: WaitUntil, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(web, "SILENT_S", PATIENCE_S)
+    health = Health("features", "features")
+    health.set_state(ServiceState.READY)
+    with Session.open(link) as session, HealthReporter(session, health):
+        session.presence("features", instance="features").ready()
+        with serving(link, free_port) as fetch:
+            wait_until(lambda: fetch("/api/status")[0] == 200, PATIENCE_S, "it is shown")
+            told = json.loads(fetch("/api/status")[1])
+    states = {one["service"]: one["state"] for one in told["processes"]}
+    assert states["features"] == "ready"
+    assert told["troubles"] == []
+
+
+def test_who_never_tells_is_shown_as_silent_after_a_while(
+    link: LinkConfig, free_port: int, wait_until: WaitUntil, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(web, "SILENT_S", 2.0)
+    with Session.open(link) as session:
+        session.presence("features", instance="features").ready()
+        with serving(link, free_port) as fetch:
+            wait_until(lambda: fetch("/api/status")[0] == 200, PATIENCE_S, "it is shown")
+            told = json.loads(fetch("/api/status")[1])
+    states = {one["service"]: one["state"] for one in told["processes"]}
+    assert states["features"] == "silent"
 
 
 def test_slow_and_broken_clients_do_not_hold_up_others(

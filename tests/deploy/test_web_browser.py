@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from urllib.request import urlopen
 
 import pytest
 from tests.deploy.browser import Browser, chromium
@@ -57,6 +59,14 @@ def test_a_person_sees_a_station_that_runs_and_is_told_when_it_does_not(
     assert "recording to" in text(browser, "recordings")
     assert "features-twin:" in text(browser, "processes")
     assert text(browser, "alarm") == ""
+    # Links from process to process outlive the router: nothing of what is below is old.
+    with urlopen(f"{station.address}/api/status", timeout=PATIENCE_S) as answer:
+        status = json.dumps(json.load(answer) | {"router": False})
+    said, kind = browser.evaluate(
+        f"(show({status}), [at('alarm').textContent, document.body.className])"
+    )
+    assert said.startswith("What is below still comes, but the router is gone.")
+    assert "old" not in kind
     station.stop()
     wait_until(lambda: "does not answer" in text(browser, "alarm"), PATIENCE_S, "it is told")
 

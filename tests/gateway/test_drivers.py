@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
 from palpate.errors import ConfigError, MissingExtraError
 from palpate_gateway import drivers
@@ -34,6 +35,17 @@ def test_unknown_option_names_the_nearest() -> None:
         drivers.make_device("text_log", {})
     with pytest.raises(ConfigError, match="indenter"):
         drivers.make_device("virtual", {"indenter": "sphere_9mm"})
+
+
+@pytest.mark.parametrize("serial", ["ünï çode", "x" * 65, "a\nb"])
+@pytest.mark.parametrize("name", drivers.DRIVERS)
+def test_a_serial_number_is_published_as_given_or_refused(name: str, serial: str) -> None:
+    options = drivers.find_driver(name).options_class
+    for key in {"serial", "wrench_serial"} & options.model_fields.keys():
+        with pytest.raises(ValidationError) as caught:
+            options.model_validate({key: serial})
+        (problem,) = [one["msg"] for one in caught.value.errors() if one["loc"] == (key,)]
+        assert "1 to 64 printable ASCII characters" in problem
 
 
 def test_entry_points_add_drivers(monkeypatch: pytest.MonkeyPatch) -> None:

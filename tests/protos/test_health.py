@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import os
 import threading
 import time
@@ -258,3 +260,22 @@ def test_gauges_that_a_source_has_no_more_are_gone() -> None:
     assert {k: v for k, v in told.items() if not k.startswith("process_")} == {
         "wall_error_s": 0.1, "thumb.b": 4.0, "ring.a": 3.0,
     }  # fmt: skip
+
+
+def test_a_gauge_that_measures_nothing_is_left_out_and_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    health = Health("gateway", "gateway")
+    health.gauge("wall_error_s", 0.1)
+    with caplog.at_level(logging.WARNING):
+        for value in (math.nan, math.inf):
+            health.gauge("wall_error_s", value)
+        health.set_gauges("thumb", {"thumb.a": 1.0, "thumb.b": -math.inf})
+    told = health.status()
+    assert STATUS_CODEC.decode(STATUS_CODEC.encode(told)) == told
+    assert told.gauges["thumb.a"] == 1.0
+    assert not {"wall_error_s", "thumb.b"} & told.gauges.keys()
+    assert told.counters == {"gauges_not_finite": 3}
+    assert [one.getMessage().split()[1] for one in caplog.records] == ["wall_error_s", "thumb.b"]
+    health.gauge("wall_error_s", 0.2)
+    assert health.status().gauges["wall_error_s"] == 0.2

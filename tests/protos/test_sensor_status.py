@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,15 @@ import pytest
 from palpate.codec import STATUS, WRENCH_ZERO
 from palpate.errors import WireError
 from palpate.health import Health
-from palpate.messages import ChannelFault, FaultKind, SensorState, SensorStatus, Status
+from palpate.messages import (
+    GAUGE_MAX,
+    ChannelFault,
+    FaultKind,
+    SensorState,
+    SensorStatus,
+    Status,
+    SupervisedProcess,
+)
 from palpate.v1 import service_pb2
 
 STATES = (
@@ -62,6 +71,52 @@ def test_a_bad_state_is_refused(
     with pytest.raises(WireError) as caught:
         STATUS.encode(dataclasses.replace(examples["Status"], sensor_states=(bad,)))
     assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -1e308, 2 * GAUGE_MAX])
+def test_a_gauge_that_measures_nothing_hides_nothing_else(
+    examples: dict[str, Any], value: float
+) -> None:
+    status = dataclasses.replace(examples["Status"], gauges={"queue_messages": 3.0})
+    message = service_pb2.Status.FromString(STATUS.encode(status))
+    message.gauges["latency_p50_s"] = value
+    assert STATUS.decode(message.SerializeToString()) == status
+    with pytest.raises(WireError, match="latency_p50_s") as caught:
+        STATUS.encode(dataclasses.replace(status, gauges={"latency_p50_s": value}))
+    assert caught.value.reason == "gauge"
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        *(({"uptime_s": value}, "uptime") for value in (math.nan, math.inf, -1.0, 1e308)),
+        ({"processes": (SupervisedProcess("fem", "fem", "running", 1, 0, math.inf),)}, "uptime"),
+        ({"monotonic_ns": 1 << 63}, "time"),
+        ({"wall_ns": -1}, "time"),
+        ({"counters": {"lost": -1}}, "counter"),
+        ({"counters": {"lost": 1 << 64}}, "counter"),
+    ],
+)
+def test_a_status_with_a_number_that_cannot_be_is_not_sent(
+    examples: dict[str, Any], changes: dict[str, Any], reason: str
+) -> None:
+    with pytest.raises(WireError) as caught:
+        STATUS.encode(dataclasses.replace(examples["Status"], **changes))
+    assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1.0, 1e308])
+def test_nor_is_it_taken_when_it_comes(examples: dict[str, Any], value: float) -> None:
+    payload = STATUS.encode(examples["Status"])
+    whole = service_pb2.Status.FromString(payload)
+    whole.uptime_s = value
+    child = service_pb2.Status.FromString(payload)
+    child.processes.add(service="fem", instance="fem", state="running", uptime_s=value)
+    time = service_pb2.Status.FromString(payload)
+    time.monotonic_ns = 1 << 63
+    for message in (whole, child, time):
+        with pytest.raises(WireError):
+            STATUS.decode(message.SerializeToString())
 
 
 def test_long_words_are_cut_when_sent_and_refused_when_they_come(examples: dict[str, Any]) -> None:

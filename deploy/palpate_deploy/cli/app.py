@@ -304,8 +304,12 @@ def new_station(
         str, typer.Option(help="Serial number of the BioTac, if it sends none.")
     ] = "",
     listen: Annotated[
-        str, typer.Option(metavar="ENDPOINT", help="Where the station's router listens.")
-    ] = DEFAULT_CONNECT,
+        str | None,
+        typer.Option(
+            metavar="ENDPOINT",
+            help=f"Where the station's router listens; default: {DEFAULT_CONNECT}.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The profile; default: NAME.toml.")
     ] = None,

@@ -10,6 +10,7 @@ from palpate.census import ROUTER
 from palpate.messages import SensorStatus, Status, SupervisedProcess
 from palpate_deploy.station.observation import ObservedProcess
 from palpate_deploy.station.status import TROUBLE
+from palpate_deploy.station.troubles import RUNNING
 
 _QUANTILE = re.compile(r"(.+)_p(50|99)_s")
 _IN = frozenset({"frames_received", "fields_received", "received"})
@@ -163,7 +164,8 @@ def _process(
         router = (report.service, report.instance) == ROUTER
         state = ("routes" if router else "silent") if report.alive else "missing"
         if not report.alive and supervised is not None:
-            state = supervised.state
+            # Where it has served and is gone from the bus, it hangs or has lost its link.
+            state = "silent" if supervised.state == RUNNING else supervised.state
         gauges: Mapping[str, float] = {}
         if router and supervisor is not None:
             prefix = f"{ROUTER[0]}."

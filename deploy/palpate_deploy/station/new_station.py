@@ -23,7 +23,7 @@ from palpate.config import DEFAULT_ROUTER, check_name
 from palpate.errors import ConfigError, DeviceError, printable
 from palpate.messages import COUNTS_MAX
 from palpate.process import check_installed
-from palpate_deploy.station.profile import Profile, load_profile, parse_profile
+from palpate_deploy.station.profile import changed, load_profile, parse_profile, read_toml
 from palpate_gateway.cli.inventory import can_buses, serial_ports
 from palpate_gateway.cli.key_values import (
     command_words,
@@ -74,7 +74,7 @@ class StationWanted:
         path: Where its profile is written.
         devices: Words for a device, by the sensor's name; what is not named is asked for.
         serial: Serial number of the BioTac, where it sends none; empty = unknown.
-        listen: Where its router listens.
+        listen: Where its router listens; None = the default, or what the profile there says.
         yes: Ask nothing, take what is found if there is no choice.
         anyway: Write the profile although a device does not answer.
     """
@@ -83,7 +83,7 @@ class StationWanted:
     path: Path
     devices: Mapping[str, str]
     serial: str = ""
-    listen: str = DEFAULT_ROUTER
+    listen: str | None = None
     yes: bool = False
     anyway: bool = False
 
@@ -131,8 +131,11 @@ def make_station(wanted: StationWanted) -> None:
     given = {sensor: _parsed(sensor, words) for sensor, words in wanted.devices.items()}
     if wanted.serial and FINGER in given:
         given[FINGER].options["serial"] = wanted.serial
+    if wanted.listen is not None:
+        # Here, since a PALPATE_ROUTER__LISTEN of today would hide it when the profile is parsed.
+        changed(parse_profile({}, where="--listen"), router={"listen": [wanted.listen]})
     if wanted.path.exists():
-        _check_same(load_profile(wanted.path), wanted, given.values())
+        _check_same(wanted, given.values())
         print(f"{wanted.path} is there: it stays as it is")
         return
     if not wanted.path.parent.is_dir():
@@ -170,10 +173,14 @@ def _parsed(sensor: str, words: str) -> WantedDevice:
     return WantedDevice(sensor, driver, options)
 
 
-def _check_same(there: Profile, wanted: StationWanted, given: Iterable[WantedDevice]) -> None:
+def _check_same(wanted: StationWanted, given: Iterable[WantedDevice]) -> None:
     """Raise a ``ConfigError`` if the profile that is there is not the one that is wanted."""
+    there = load_profile(wanted.path)
     known = {sensor.name: sensor for sensor in there.gateway.sensors}
     other = [] if there.station == wanted.name else [f"station {there.station!r}"]
+    if wanted.serial and FINGER not in wanted.devices:
+        driver = known[FINGER].driver if FINGER in known else ""
+        given = [*given, WantedDevice(FINGER, driver, {"serial": wanted.serial})]
     for device in given:
         sensor = known.get(device.sensor)
         if sensor is None:
@@ -186,6 +193,10 @@ def _check_same(there: Profile, wanted: StationWanted, given: Iterable[WantedDev
                 for key, value in device.options.items()
                 if sensor.options.get(key) != value
             ]
+    # As the file says it: PALPATE_ROUTER__LISTEN is of today.
+    listen = read_toml(wanted.path).get("router", {}).get("listen", [DEFAULT_ROUTER])
+    if wanted.listen is not None and listen != [wanted.listen]:
+        other.append(f"a router that listens at {', '.join(listen)}")
     if other:
         raise ConfigError(
             f"{wanted.path} is there and says otherwise: {', '.join(other)}",
@@ -437,7 +448,7 @@ def profile_text(wanted: StationWanted, probed: Sequence[ProbedDevice]) -> str:
         'processes = ["router", "gateway", "features", "recorder"]\n',
         "[router]\n"
         "# Robots and commands join here. For other hosts: docs/security.md.\n"
-        f"listen = {toml_value([wanted.listen])}\n",
+        f"listen = {toml_value([wanted.listen or DEFAULT_ROUTER])}\n",
     ]
     for one in probed:
         device = one.device

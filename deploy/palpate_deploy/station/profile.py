@@ -300,9 +300,11 @@ def changed(profile: Profile, **tables: Mapping[str, Any]) -> Profile:
     for table, keys in tables.items():
         values[table] = {**values.get(table, {}), **keys}
     try:
-        return Profile.model_validate(values)
+        replaced = Profile.model_validate(values)
     except ValidationError as error:
         raise config_error(Profile, error, where="command line") from error
+    _check_router(replaced, "command line")
+    return replaced
 
 
 def plain_values(profile: Profile) -> dict[str, Any]:

@@ -17,6 +17,9 @@ from palpate.messages import ServiceState, SupervisedProcess
 from palpate_deploy.station.host import running_folders
 from palpate_deploy.station.profile import load_profile
 
+RUNNING = "running"
+"""What a supervisor says of a process that has served and has not ended."""
+
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
@@ -158,6 +161,11 @@ def _wrong(report: ProcessReport, supervised: SupervisedProcess | None) -> tuple
             return "does not run", "start it with `palpate up`, or take it out of the profile"
         if supervised.state == "exited":  # a finite source at its end: others are started again
             return None
+        if supervised.state == RUNNING:
+            return (
+                "runs and cannot be reached",
+                "one that hangs is replaced within 10 s: ask again; if it stays, see its log",
+            )
         times = f", started again {supervised.restarts} times" if supervised.restarts else ""
         return (
             f"does not serve: its supervisor says {supervised.state}{times}",

@@ -16,7 +16,7 @@ from palpate.messages import BIOTAC_SP_LAYOUT, Origin, SensorType
 from palpate_gateway.biotac.frames import FrameAssembler
 from palpate_gateway.biotac.slot_link import FingerQueue, SlotLink, SlotSource
 from palpate_gateway.biotac.slots import SlotBlock
-from palpate_gateway.device import SERIAL_MAX, Device, DeviceIdentity, DeviceInfo
+from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo, SerialOption
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import Reading
 
@@ -82,7 +82,7 @@ class FingerOptions(StrictConfig):
     """
 
     port: int = Field(default=1, ge=1, le=5)
-    serial: str = Field(default="", max_length=SERIAL_MAX, pattern=r"^[ -~]*$")
+    serial: SerialOption = ""
     # Excluded from the settings of the line: its fingers may be of different types.
     sensor_type: TypeOption = Field(default="auto", exclude=True)
     sequence: SequenceOption = "learn"

@@ -21,7 +21,7 @@ from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
 from palpate.messages import COUNTS_MAX, PAC_SAMPLES, Origin, SensorType
 from palpate_gateway.biotac.finger import TypeOption
 from palpate_gateway.clock.sample_times import SampleClock, SampleVerdict
-from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo
+from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo, SerialOption
 from palpate_gateway.ports.port import settle
 from palpate_gateway.ports.serial_port import SerialPort
 from palpate_gateway.protocols import channels as ch
@@ -58,7 +58,7 @@ class Pic32Options(StrictConfig):
     baud: int = Field(default=ask.BAUD, gt=0)
     rts_cts: bool = True
     layout: Pic32Layout = Pic32Layout.PAC_FIRST
-    serial: str = ""
+    serial: SerialOption = ""
     sensor_type: TypeOption = "auto"
 
 

@@ -18,7 +18,7 @@ from palpate.errors import ConfigError, RecordingError
 from palpate.messages import SensorType
 from palpate_gateway.biotac.frames import FrameAssembler
 from palpate_gateway.biotac.slots import UNKNOWN, SlotBlock
-from palpate_gateway.device import DeviceIdentity, FileDevice
+from palpate_gateway.device import DeviceIdentity, FileDevice, SerialOption
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading
 from palpate_gateway.recordings.text_log_format import (
@@ -40,7 +40,7 @@ class TextLogOptions(StrictConfig):
 
     path: Path
     port: int = Field(default=0, ge=0, le=5)
-    serial: str = ""
+    serial: SerialOption = ""
 
 
 _FIRST = -1

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import field_validator
 
 from palpate.errors import ConfigError, RecordingError, WireError
 from palpate.messages import SensorType
 from palpate.process import require
 from palpate.ros.layouts import BIOTAC_ALL, BIOTAC_HAND, MD5, WRENCH_STAMPED, Dialect, typestore
 from palpate.ros.rmw_zenoh import check_topic_name
-from palpate_gateway.device import DeviceIdentity, FileDevice
+from palpate_gateway.device import DeviceIdentity, FileDevice, SerialOption
 from palpate_gateway.protocols.ros_hands import RosFinger, RosHand, decode_hand
 from palpate_gateway.readings import ElectrodeReading, WrenchReading
 from palpate_gateway.ros.biotac import RosFingerOptions
@@ -49,7 +49,7 @@ class RosBagOptions(RosFingerOptions):
     topic: str = ""
     wrench_topic: str = ""
     mount: MountOptions = MountOptions()
-    wrench_serial: str = Field(default="", max_length=64, pattern=r"^[ -~]*$")
+    wrench_serial: SerialOption = ""
 
     @field_validator("topic", "wrench_topic")
     @classmethod

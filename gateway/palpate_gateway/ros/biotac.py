@@ -14,7 +14,7 @@ from palpate.config import LinkConfig, StrictConfig
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate.messages import Origin, SensorType
 from palpate.ros.layouts import BIOTAC_ALL, BIOTAC_HAND
-from palpate_gateway.device import SERIAL_MAX, DeviceIdentity, DeviceInfo
+from palpate_gateway.device import DeviceIdentity, DeviceInfo, SerialOption
 from palpate_gateway.protocols.ros_hands import RosHand, decode_hand
 from palpate_gateway.readings import ElectrodeReading, Reading
 from palpate_gateway.ros.finger_track import Channel, FingerTrack
@@ -49,7 +49,7 @@ class RosFingerOptions(StrictConfig):
     """
 
     finger: int = Field(default=1, ge=1, le=5)
-    serial: str = Field(default="", max_length=SERIAL_MAX, pattern=r"^[ -~]*$")
+    serial: SerialOption = ""
     rate_hz: float = Field(default=100.0, gt=0.0, le=10_000.0)
     missing: tuple[Channel, ...] = ()
     repeats: Literal["drop", "keep"] = "drop"

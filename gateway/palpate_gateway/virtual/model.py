@@ -11,6 +11,7 @@ from pydantic import Field
 
 from palpate.config import StrictConfig
 from palpate.messages import CountArray, FloatArray
+from palpate_gateway.device import SerialOption
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import ElectrodeReading, PoseReading, Reading, WrenchReading
 from palpate_gateway.virtual.faults import VirtualFault
@@ -63,7 +64,7 @@ class VirtualOptions(StrictConfig):
     trajectories: tuple[str, ...] = ()
     seed: int = Field(default=0, ge=0)
     unit: int | str = 1
-    serial: str = ""
+    serial: SerialOption = ""
     indenter: str = ""
     rate_hz: float = Field(default=100.0, ge=1.0, le=2000.0)
     realtime: bool = True

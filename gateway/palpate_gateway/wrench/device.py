@@ -22,7 +22,7 @@ from palpate.config import StrictConfig
 from palpate.errors import DeviceLost, DeviceTimeout
 from palpate.messages import FloatArray, Origin
 from palpate.rigid import is_rotation, quaternion_length, rotation_matrices
-from palpate_gateway.device import SERIAL_MAX, Device, DeviceIdentity, DeviceInfo
+from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo, SerialOption
 from palpate_gateway.readings import ClockObservation, Reading, WrenchReading
 
 Floats = npt.NDArray[np.float64]
@@ -114,7 +114,7 @@ class WrenchOptions(StrictConfig):
     """
 
     mount: MountOptions = MountOptions()
-    serial: str = Field(default="", max_length=SERIAL_MAX, pattern=r"^[ -~]*$")
+    serial: SerialOption = ""
     zero_at_start: bool = False
     zero_max_sd_n: float = Field(default=0.5, gt=0.0)
     zero_max_sd_nm: float = Field(default=0.02, gt=0.0)

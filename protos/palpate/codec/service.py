@@ -23,7 +23,9 @@ from palpate.codec.base import (
 from palpate.codec.models import served_from_wire, served_to_wire
 from palpate.errors import ErrorCode
 from palpate.messages import (
+    GAUGE_MAX,
     NO_TARE,
+    UPTIME_MAX_S,
     ChannelFault,
     ErrorReply,
     FaultKind,
@@ -51,6 +53,7 @@ _STATES = {int(state): state for state in ServiceState}
 _CODES = {int(code): code for code in ErrorCode}
 _LINE_MAX, _TEXT_MAX = 1024, 4096  # [characters]
 _TIME_MAX = (1 << 63) - 1
+_COUNT_MAX = (1 << 64) - 1
 
 
 def sensor_status_from_wire(msg: service_pb2.SensorStatus) -> SensorStatus:
@@ -99,6 +102,12 @@ def _check_time(time_ns: int) -> int:
     if not 0 <= time_ns <= _TIME_MAX:
         reject("time", f"time {time_ns} ns is not in int64")
     return time_ns
+
+
+def _check_uptime(uptime_s: float) -> float:
+    if not 0.0 <= uptime_s <= UPTIME_MAX_S:  # NaN is refused, too
+        reject("uptime", f"uptime {uptime_s} s is not in [0, {UPTIME_MAX_S:g}]")
+    return uptime_s
 
 
 def _zero_from_wire(msg: service_pb2.WrenchZero) -> WrenchZero:
@@ -212,7 +221,7 @@ def _process_from_wire(msg: service_pb2.SupervisedProcess) -> SupervisedProcess:
         check_serial(msg.state, "state of a process"),
         msg.pid,
         msg.restarts,
-        msg.uptime_s,
+        _check_uptime(msg.uptime_s),
     )
 
 
@@ -223,7 +232,7 @@ def _process_to_wire(process: SupervisedProcess) -> service_pb2.SupervisedProces
         state=check_serial(process.state, "state of a process"),
         pid=process.pid,
         restarts=process.restarts,
-        uptime_s=process.uptime_s,
+        uptime_s=_check_uptime(process.uptime_s),
     )
 
 
@@ -235,12 +244,13 @@ def _status_from_wire(msg: service_pb2.Status) -> Status:
         check_serial(msg.service, "service"),
         check_serial(msg.instance, "instance"),
         state,
-        msg.monotonic_ns,
-        msg.wall_ns,
-        msg.uptime_s,
+        _check_time(msg.monotonic_ns),
+        _check_time(msg.wall_ns),
+        _check_uptime(msg.uptime_s),
         msg.version,
         dict(msg.counters),
-        dict(msg.gauges),
+        # Not refused: all else that the process says of itself is still to be known.
+        {name: value for name, value in msg.gauges.items() if abs(value) <= GAUGE_MAX},
         tuple(msg.sensors),
         _check_text(msg.message, "message"),
         _error_from_wire(msg.last_error) if msg.HasField("last_error") else None,
@@ -251,13 +261,19 @@ def _status_from_wire(msg: service_pb2.Status) -> Status:
 
 
 def _status_encode(status: Status) -> bytes:
+    for name, value in status.gauges.items():
+        if not abs(value) <= GAUGE_MAX:  # NaN is refused, too
+            reject("gauge", f"gauge {name!r} = {value} is not in [-{GAUGE_MAX:g}, {GAUGE_MAX:g}]")
+    for name, count in status.counters.items():
+        if not 0 <= count <= _COUNT_MAX:
+            reject("counter", f"counter {name!r} = {count} is not in uint64")
     return service_pb2.Status(
         service=check_serial(status.service, "service"),
         instance=check_serial(status.instance, "instance"),
         state=int(status.state),  # type: ignore[arg-type]
-        monotonic_ns=status.monotonic_ns,
-        wall_ns=status.wall_ns,
-        uptime_s=status.uptime_s,
+        monotonic_ns=_check_time(status.monotonic_ns),
+        wall_ns=_check_time(status.wall_ns),
+        uptime_s=_check_uptime(status.uptime_s),
         version=status.version,
         counters=dict(status.counters),
         gauges=dict(status.gauges),

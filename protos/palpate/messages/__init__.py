@@ -52,6 +52,8 @@ from palpate.messages.requests import (
     SynthesisRequest,
 )
 from palpate.messages.service import (
+    GAUGE_MAX,
+    UPTIME_MAX_S,
     ChannelFault,
     ErrorReply,
     FaultKind,
@@ -85,8 +87,10 @@ __all__ = [
     "BIOTAC_LAYOUT",
     "BIOTAC_SP_LAYOUT",
     "COUNTS_MAX",
+    "GAUGE_MAX",
     "NO_TARE",
     "PAC_SAMPLES",
+    "UPTIME_MAX_S",
     "BasisRequest",
     "ChannelFault",
     "ContactDescription",

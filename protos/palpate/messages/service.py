@@ -185,6 +185,13 @@ class SupervisedProcess:
     uptime_s: float = 0.0
 
 
+GAUGE_MAX = 1e18
+"""Largest magnitude of a gauge; a larger one, or NaN, measures nothing and is left out."""
+
+UPTIME_MAX_S = 1e10
+"""Longest uptime [s]: 300 years, as in int64 nanoseconds."""
+
+
 @dataclass(frozen=True, slots=True)
 class Status:
     """State and counters of a process: sent each second, on a change of state, and when asked.
@@ -197,7 +204,7 @@ class Status:
         uptime_s: Since the process was ready to count [s].
         version: Version of palpate.
         counters: Events since the start.
-        gauges: Present values; the name ends in the unit.
+        gauges: Present values, at most ``GAUGE_MAX``; the name ends in the unit.
         sensors: Sensors it serves.
         message: One line for people.
         sensor_states: Of a gateway: each of its sensors.

@@ -12,17 +12,18 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from palpate.bus import Session
+from palpate.census import ROUTER
 from palpate.config import LinkConfig, endpoint_host_port
 from palpate.errors import LinkError, MissingExtraError
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
 from palpate.messages import ServiceState
 from palpate.process import check_installed, require
-from palpate_deploy.station.observation import StationObserver
+from palpate_deploy.station.observation import SILENT_S, ObservedProcess, StationObserver
 from palpate_deploy.station.profile import WebConfig
 from palpate_deploy.station.web.application import WebApplication
 from palpate_deploy.station.web.snapshot import as_json, snapshot
@@ -84,6 +85,7 @@ def run_web(
             health.set_state(ServiceState.READY, f"http://{config.listen}{live}")
             presence.ready()
             looked_s = float("-inf")
+            began_s, shown = time.monotonic(), False
             while not stop.wait(_TURN_S):
                 beat()
                 if view is not None:
@@ -91,16 +93,26 @@ def run_web(
                         health.count(name, count)
                 if time.monotonic() - looked_s >= _LOOK_S:
                     looked_s = time.monotonic()
+                    observed = observer.look()
+                    shown = shown or _all_told(observed) or looked_s - began_s > SILENT_S
+                    if not shown:
+                        continue  # who has not told yet would be shown as one that is silent
                     plain = snapshot(
-                        station,
-                        observer.look(),
-                        router=session.has_router(),
-                        own=(SERVICE, instance),
+                        station, observed, router=session.has_router(), own=(SERVICE, instance)
                     )
                     plain["live"] = view is not None
                     application.set_status(as_json(plain))
             presence.not_ready()
             health.set_state(ServiceState.STOPPING)
+
+
+def _all_told(observed: Iterable[ObservedProcess]) -> bool:
+    """Whether the status of every process that lives has come; the router has none."""
+    return all(
+        one.report.status is not None
+        for one in observed
+        if one.report.alive and (one.report.service, one.report.instance) != ROUTER
+    )
 
 
 def _has_rerun() -> bool:

@@ -46,7 +46,7 @@ def snapshot(
     plain: dict[str, Any] = {
         "station": station,
         "router": router,
-        "answers": router and bool(answering),
+        "answers": bool(answering),
         "left_out": len(observed) - len(shown),
         "sensors": [
             {**asdict(one), "age_s": ages_s.get(one.gateway)}

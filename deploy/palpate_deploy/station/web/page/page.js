@@ -74,9 +74,10 @@ function show(status) {
   whole.textContent = `${well} of ${status.processes.length} processes well${wrong ? `, ${wrong} wrong` : ""}`;
   whole.className = `word ${wrong ? "bad" : "good"}`;
   at("live").hidden = !status.live;
-  alarm(status.answers ? "" : status.router
-    ? "The station does not answer: its router is there, but no process of it. Start it with: palpate up"
-    : "The station does not answer: its router is gone. It starts again by itself, or with: palpate up");
+  const gone = "the router is gone. It starts again by itself, or with: palpate up";
+  const nobody = "The station does not answer: its router is there, but no process of it. Start it with: palpate up";
+  if (status.answers) alarm(status.router ? "" : `What is below still comes, but ${gone}`, false);
+  else alarm(status.router ? nobody : `The station does not answer: ${gone}`);
 
   table("sensors",
     ["sensor", "state", right("for"), right("Hz"), right("told before"), right("p50 ms"), right("p99 ms"), right("tare age"), right("drift [counts]"), "says"],
@@ -120,11 +121,11 @@ function show(status) {
   at("wrong").hidden = !wrong;
 }
 
-function alarm(text) {
+function alarm(text, old = true) {
   const element = at("alarm");
   if (element.textContent !== text) element.textContent = text;
   element.hidden = !text;
-  document.body.classList.toggle("old", Boolean(text));
+  document.body.classList.toggle("old", old && Boolean(text));
 }
 
 let heard = Date.now();
@@ -132,10 +133,15 @@ let heard = Date.now();
 async function ask() {
   try {
     const answer = await fetch("/api/status", { signal: AbortSignal.timeout(PATIENCE_MS) });
-    if (!answer.ok) throw new Error(await answer.text());
-    show(await answer.json());
-    heard = Date.now();
-    at("clock").textContent = `as of ${new Date().toLocaleTimeString()}`;
+    if (answer.status === 503) { // the server has just begun to look at the station
+      at("whole").textContent = "is being looked at";
+      at("whole").className = "word waiting";
+    } else {
+      if (!answer.ok) throw new Error(await answer.text());
+      show(await answer.json());
+      heard = Date.now();
+      at("clock").textContent = `as of ${new Date().toLocaleTimeString()}`;
+    }
   } catch (error) {
     const since = (Date.now() - heard) / 1e3;
     at("whole").textContent = "not known";
