@@ -135,10 +135,10 @@ def test_whatever_listens_does_so_on_loopback_by_default() -> None:
     listening = 0
     for name, command in _commands(typer.main.get_command(app), "palpate"):
         for option in command.params:
-            if "--listen" not in option.opts or not option.default:
+            default = option.default or getattr(option, "show_default", None)
+            if "--listen" not in option.opts or not isinstance(default, str):
                 continue
             listening += 1
-            default = str(option.default)
             address = default if "/" not in default else endpoint_host_port(default)[0]
             assert is_loopback(address), f"{name} --listen {default}"
     assert listening >= 5

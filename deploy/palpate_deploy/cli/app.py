@@ -307,7 +307,8 @@ def new_station(
         str | None,
         typer.Option(
             metavar="ENDPOINT",
-            help=f"Where the station's router listens; default: {DEFAULT_CONNECT}.",
+            help="Where the station's router listens.",
+            show_default=DEFAULT_CONNECT,
         ),
     ] = None,
     out: Annotated[
