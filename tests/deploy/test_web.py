@@ -363,6 +363,18 @@ def test_a_station_is_shown_while_it_runs_and_said_to_be_gone_afterwards(
         wait_until(lambda: not status()["answers"], PATIENCE_S, "the page says that it is gone")
 
 
+def first_shown(
+    session: Session, link: LinkConfig, port: int, wait_until: WaitUntil
+) -> tuple[str, dict[str, Any]]:
+    """The state of ``features`` in the first status that a page shows, and all of that status."""
+    session.presence("features", instance="features").ready()
+    with serving(link, port) as fetch:
+        wait_until(lambda: fetch("/api/status")[0] == 200, PATIENCE_S, "it is shown")
+        told = json.loads(fetch("/api/status")[1])
+    states = {one["service"]: one["state"] for one in told["processes"]}
+    return states["features"], told
+
+
 def test_nobody_is_shown_as_silent_before_it_could_tell(
     link: LinkConfig, free_port: int, wait_until: WaitUntil, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -370,12 +382,8 @@ def test_nobody_is_shown_as_silent_before_it_could_tell(
     health = Health("features", "features")
     health.set_state(ServiceState.READY)
     with Session.open(link) as session, HealthReporter(session, health):
-        session.presence("features", instance="features").ready()
-        with serving(link, free_port) as fetch:
-            wait_until(lambda: fetch("/api/status")[0] == 200, PATIENCE_S, "it is shown")
-            told = json.loads(fetch("/api/status")[1])
-    states = {one["service"]: one["state"] for one in told["processes"]}
-    assert states["features"] == "ready"
+        state, told = first_shown(session, link, free_port, wait_until)
+    assert state == "ready"
     assert told["troubles"] == []
 
 
@@ -384,12 +392,8 @@ def test_who_never_tells_is_shown_as_silent_after_a_while(
 ) -> None:
     monkeypatch.setattr(web, "SILENT_S", 2.0)
     with Session.open(link) as session:
-        session.presence("features", instance="features").ready()
-        with serving(link, free_port) as fetch:
-            wait_until(lambda: fetch("/api/status")[0] == 200, PATIENCE_S, "it is shown")
-            told = json.loads(fetch("/api/status")[1])
-    states = {one["service"]: one["state"] for one in told["processes"]}
-    assert states["features"] == "silent"
+        state, _ = first_shown(session, link, free_port, wait_until)
+    assert state == "silent"
 
 
 def test_slow_and_broken_clients_do_not_hold_up_others(

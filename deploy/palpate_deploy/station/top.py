@@ -51,7 +51,7 @@ _STAGES = {
 """Stages of an estimate, in the order of its way."""
 
 _STATE_COLOURS = {
-    "ready": "green", "live": "green", "routes": "green", "running": "green",
+    "ready": "green", "live": "green", "routes": "green",
     "finished": "cyan", "ended": "cyan",
     "degraded": "red", "missing": "red", "silent": "red", "lost": "red", "zero_lost": "red",
 }  # fmt: skip

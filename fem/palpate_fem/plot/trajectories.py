@@ -79,8 +79,7 @@ def plot_overview(
         Number of trajectories by outcome.
 
     Raises:
-        DatasetError: There is no trajectory.
-        DatasetError: The disk is full or refuses.
+        DatasetError: There is no trajectory, or the disk is full or refuses.
         MissingExtraError: matplotlib is not installed.
     """
     if not summaries:

@@ -6,7 +6,7 @@ const PATIENCE_MS = 4000;
 const SHOWN = "#with-live-view";
 
 const COLOURS = {
-  ready: "good", live: "good", routes: "good", running: "good",
+  ready: "good", live: "good", routes: "good",
   finished: "done", ended: "done",
   degraded: "bad", missing: "bad", silent: "bad", lost: "bad", zero_lost: "bad",
 };
