@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo quick test durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel readers release clean sbom audit debian chaos
+.PHONY: help setup demo quick test test-all durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel readers release clean sbom audit debian chaos
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -39,18 +39,25 @@ demo: $(VENV)/.demo  ## virtual finger -> features -> recorder: live table and p
 quick: $(VENV)/.dev  ## for every save: lint, borders and most tests; types once checked before | 1-2 min
 	@if [ -d .mypy_cache ]; then $(BIN)/mypy; \
 	else echo "palpate: types are left out: make check fills mypy's cache, later runs use it"; fi
-	@$(pytest_parallel) --quick
+	@$(pytest_parallel) --tier quick
 
 # Hundreds of tests start processes and wait for them, and a busy machine fails one in some thousand.
 # What is broken fails alone, too. Anything but failed tests (status 1) is an end at once.
-test: $(VENV)/.dev  ## all tests; the gates of `check` are among them | 25-30 min on two cores after setup
-	@status=0; $(pytest_parallel) || status=$$?; \
+define run_tests
+@status=0; $(pytest_parallel) $(1) || status=$$?; \
 	if [ $$status -eq 1 ]; then \
 		echo "palpate: what has failed is run once more, alone; what passes now is worth a look: it cannot stand a busy machine"; \
 		status=0; $(FOR_TESTS) $(BIN)/pytest --last-failed --last-failed-no-failures none || status=$$?; \
 	fi; exit $$status
+endef
 
-durations: $(VENV)/.dev  ## all tests; measure anew which ones `quick` leaves out | 25-30 min on two cores
+test: $(VENV)/.dev  ## tests of every file, the gates of `check` among them; what CI runs | MINUTES_TEST min on two cores after setup
+	$(call run_tests,--tier test)
+
+test-all: $(VENV)/.dev  ## all tests: before a release, and after a change that reaches far | MINUTES_ALL min on two cores
+	$(call run_tests,)
+
+durations: $(VENV)/.dev  ## all tests; measure anew what `quick` and `test` leave out | MINUTES_ALL min on two cores
 	@$(pytest_parallel) --record-durations
 
 # The gates are written here and nowhere else: tests/house/test_style.py reads and runs these lines.

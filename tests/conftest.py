@@ -1,9 +1,9 @@
-"""Fixtures that every room's tests may use, the quick tier, and the order of a parallel run.
+"""Fixtures that every room's tests may use, tiers of tests, and the order of a parallel run.
 
-`make quick` runs what `tests/durations.json` does not leave out: in each file the fastest tests
-until the file has used `QUICK_S`, and none that needs a fixture of more than `FIXTURE_S`.
-`make durations` measures all tests and writes that file anew; a test that it does not know yet
-belongs to the quick tier.
+`make quick` and `make test` run a tier each, `make test-all` runs everything. A tier has of each
+file the fastest tests until the file has used its time (`TIERS`); `make test` also has what is
+marked ``essential``. `make durations` runs all tests, measures them, and writes to
+`tests/durations.json` what each tier leaves out. A test that it does not know yet is in both tiers.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,21 +31,47 @@ from palpate.config import LinkConfig
 ROOT = Path(__file__).resolve().parents[1]
 DURATIONS = Path(__file__).with_name("durations.json")
 
-QUICK_S = 0.7
-"""What a test file may take in the quick tier [s]."""
 
-ALWAYS_QUICK_S = 0.02
-"""Tests this short are in the quick tier however many a file has [s]."""
+@dataclass(frozen=True, slots=True)
+class Tier:
+    """What a tier has of each test file.
 
-FIRST_S = 2.0
-"""The fastest test of a file is in the quick tier if it takes no longer [s]."""
+    Attributes:
+        file_s: Time that a file may take: its fastest tests are taken until then [s].
+        always_s: Tests this short are taken however many a file has [s].
+        first_s: The fastest test of a file is taken if it takes no longer [s].
+        fixture_s: Tests that need a shared fixture of more than this are left out [s].
+        without: Marker of tests that are left out however short they are.
+        keeps: Marker of tests that are taken however long they are.
+    """
+
+    file_s: float
+    always_s: float
+    first_s: float
+    fixture_s: float
+    without: str | None = None
+    keeps: str | None = None
+
+    def left_out(self, seconds: dict[str, float]) -> set[str]:
+        """Tests of one file that are not in the tier, by what each takes [s]."""
+        names, used = set(), 0.0
+        for number, (test, took) in enumerate(sorted(seconds.items(), key=lambda item: item[1])):
+            fits = used + took <= self.file_s or took < self.always_s
+            if fits or (number == 0 and took < self.first_s):
+                used += took
+            else:
+                names.add(test)
+        return names
+
+
+TIERS = {
+    "quick": Tier(file_s=0.7, always_s=0.02, first_s=2.0, fixture_s=2.0, without="slow"),
+    "test": Tier(file_s=8.0, always_s=0.1, first_s=20.0, fixture_s=20.0, keeps="essential"),
+}
 
 UNKNOWN_S = 20.0
 """What the order of a parallel run expects of a file that was never measured [s]: it may be long,
 so it must not begin last."""
-
-FIXTURE_S = 2.0
-"""A shared fixture that takes longer leaves its tests out of the quick tier [s]."""
 
 PORTS = range(20_000, 32_000)
 """Below the ports that Linux hands out itself, so that no connection takes one meanwhile."""
@@ -71,7 +98,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--update-golden", action="store_true", help="write golden files anew (review the diff)"
     )
     parser.addoption(
-        "--quick", action="store_true", help="leave out what tests/durations.json calls slow"
+        "--tier", choices=list(TIERS), help="leave out what tests/durations.json says of this tier"
     )
     parser.addoption(
         "--record-durations", action="store_true", help="write tests/durations.json anew"
@@ -101,12 +128,12 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 class _Recording:
-    """Adds up what each test takes, and writes what the quick tier leaves out."""
+    """Adds up what each test and each shared fixture takes, and writes what tiers leave out."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         self._files: dict[str, float] = defaultdict(float)
-        self._fixtures: set[str] = set()
+        self._fixtures: dict[str, float] = {}
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         file, _, test = report.nodeid.partition("::")
@@ -118,16 +145,18 @@ class _Recording:
                     continue
                 # Whichever test needs it first pays for it.
                 self._seconds[file][test] -= seconds
-                if seconds > FIXTURE_S:
-                    self._fixtures.add(name)
+                self._fixtures[name] = round(seconds, 1)
 
     def pytest_sessionfinish(self) -> None:
+        shortest = min(tier.fixture_s for tier in TIERS.values())
         files = {
-            file: {"seconds": round(self._files[file], 1), "slow": slow_tests(tests)}
+            file: {"seconds": round(self._files[file], 1)}
+            | {name: sorted(tier.left_out(tests)) for name, tier in TIERS.items()}
             for file, tests in sorted(self._seconds.items())
-            if self._files[file] > QUICK_S
+            if self._files[file] > TIERS["quick"].file_s
         }
-        table = {"fixtures": sorted(self._fixtures), "files": files}
+        fixtures = {name: s for name, s in sorted(self._fixtures.items()) if s > shortest}
+        table = {"fixtures": fixtures, "files": files}
         DURATIONS.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
 
 
@@ -144,20 +173,12 @@ def pytest_fixture_setup(
     return value
 
 
-def slow_tests(seconds: dict[str, float]) -> list[str]:
-    """Tests of one file that the quick tier leaves out: all but the fastest."""
-    slow, used = [], 0.0
-    for number, (test, took) in enumerate(sorted(seconds.items(), key=lambda item: item[1])):
-        fits = used + took <= QUICK_S or took < ALWAYS_QUICK_S
-        if fits or (number == 0 and took < FIRST_S):
-            used += took
-        else:
-            slow.append(test)
-    return sorted(slow)
-
-
 def _file(item: pytest.Item) -> str:
     return item.nodeid.partition("::")[0]
+
+
+def _has(item: pytest.Item, marker: str | None) -> bool:
+    return marker is not None and item.get_closest_marker(marker) is not None
 
 
 def _fixtures(item: pytest.Item) -> set[str]:
@@ -168,20 +189,22 @@ def _fixtures(item: pytest.Item) -> set[str]:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Select the quick tier; begin a parallel run with the files that take longest."""
+    """Select a tier; begin a parallel run with the files that take longest."""
     recorded: dict[str, Any] = json.loads(DURATIONS.read_text(encoding="utf-8"))
     files: dict[str, dict[str, Any]] = recorded["files"]
-    if config.getoption("--quick"):
-        slow = {f"{file}::{test}" for file, entry in files.items() for test in entry["slow"]}
-        dear = set(recorded["fixtures"])
-        left_out = [
-            item
-            for item in items
-            if item.nodeid in slow or item.get_closest_marker("slow") or _fixtures(item) & dear
-        ]
-        config.hook.pytest_deselected(items=left_out)
-        gone = set(left_out)
-        items[:] = [item for item in items if item not in gone]
+    if name := config.getoption("--tier"):
+        tier = TIERS[name]
+        long = {f"{file}::{test}" for file, entry in files.items() for test in entry[name]}
+        dear = {one for one, took in recorded["fixtures"].items() if took > tier.fixture_s}
+
+        def is_taken(item: pytest.Item) -> bool:
+            if _has(item, tier.keeps):
+                return True
+            return not (_has(item, tier.without) or item.nodeid in long or _fixtures(item) & dear)
+
+        taken = [item for item in items if is_taken(item)]
+        config.hook.pytest_deselected(items=list(set(items) - set(taken)))
+        items[:] = taken
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: -files.get(_file(item), {}).get("seconds", UNKNOWN_S))
 

@@ -49,6 +49,7 @@ def robot(link: LinkConfig) -> Iterator[Client]:
             node.join(timeout=30)
 
 
+@pytest.mark.essential
 def test_the_shipped_services_feel_a_contact_that_was_only_described(robot: Client) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while sum(a.ready for a in robot.alive()) < 2:

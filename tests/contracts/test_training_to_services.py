@@ -35,6 +35,7 @@ def _frames(record: Path) -> tuple[list[ElectrodeFrame], dict[int, Tare], list[f
 
 
 @pytest.mark.slow
+@pytest.mark.essential
 def test_a_bundle_that_training_writes_is_served(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     from palpate_training.datasets.features import write_dataset

@@ -99,6 +99,7 @@ def test_shipped_networks_feel_presses_that_they_were_not_trained_on(
 
 
 @pytest.mark.slow
+@pytest.mark.essential
 def test_the_shipped_sample_trains_a_field_that_services_serve(
     played: list[object], tmp_path: Path
 ) -> None:

@@ -297,6 +297,7 @@ def test_a_data_set_is_of_the_finger_that_is_named(palpate: Palpate, tmp_path: P
     assert json.loads(done.stdout)["bundle"] == "features-biotac-2:1"
 
 
+@pytest.mark.essential
 def test_from_presses_to_estimates(
     up: subprocess.Popen[bytes],
     station: tuple[Path, LinkConfig],

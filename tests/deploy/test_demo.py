@@ -18,6 +18,7 @@ Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 @pytest.mark.slow
+@pytest.mark.essential
 def test_demo_ends_with_record_view_and_picture(
     palpate: Palpate, bundle: str, tmp_path: Path
 ) -> None:

@@ -40,6 +40,7 @@ def _estimate_arrives(link: LinkConfig) -> None:
             assert time.monotonic() < deadline
 
 
+@pytest.mark.essential
 def test_processes_that_hang_are_replaced_and_do_not_delay_the_end(
     up: subprocess.Popen[bytes],
     station: tuple[Path, LinkConfig],

@@ -26,7 +26,17 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="termina
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(
+            path,
+            id=path.relative_to(ROOT).as_posix(),
+            marks=pytest.mark.essential if path == ROOT / "README.md" else (),
+        )
+        for path in PAGES
+    ],
+)
 def test_commands_of_a_page_run(path: Path, tmp_path: Path, new_port: Callable[[], int]) -> None:
     if CHECKOUT in path.read_text(encoding="utf-8") and not (ROOT / ".git").exists():
         pytest.skip("no git checkout to clone from")

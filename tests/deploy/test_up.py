@@ -49,6 +49,7 @@ def _estimates_flow(session: Session, seconds: float) -> float:
         stream.close()
 
 
+@pytest.mark.essential
 def test_killed_processes_come_back_and_consumers_resume(
     up: subprocess.Popen[bytes],
     station: tuple[Path, LinkConfig],
@@ -93,6 +94,7 @@ def test_killed_processes_come_back_and_consumers_resume(
     assert list((tmp_path / "runs").glob("*.mcap"))
 
 
+@pytest.mark.essential
 def test_a_station_answers_every_command(
     up: subprocess.Popen[bytes],
     station: tuple[Path, LinkConfig],

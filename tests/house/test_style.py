@@ -1,4 +1,4 @@
-"""The gates of ``make check`` pass, so that ``make test`` alone covers everything.
+"""The gates of ``make check`` pass, so that ``make test`` alone covers them; tiers of tests.
 
 The gates are written once, as the lines of target ``check`` in the Makefile; this file reads and
 runs them with the tools of the environment that runs the tests.
@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.conftest import Tier
 
 ROOT = Path(__file__).resolve().parents[2]
 BIN = Path(sys.executable).parent
@@ -29,6 +30,7 @@ def _gates() -> list[str]:
     return [line for line in lines if not line.startswith("pytest ")]
 
 
+@pytest.mark.essential
 @pytest.mark.parametrize(
     "gate",
     [pytest.param(gate, marks=pytest.mark.slow if gate == "mypy" else ()) for gate in _gates()],
@@ -80,3 +82,25 @@ def test_ci_runs_exactly_the_test_command() -> None:
         if line and not line.startswith(("#", "set ", "cd "))
     ]
     assert commands == ["make test"]
+
+
+def test_a_tier_has_the_fastest_tests_of_each_file() -> None:
+    tier = Tier(file_s=5.0, always_s=0.1, first_s=20.0, fixture_s=20.0)
+    assert tier.left_out({"long": 3.0, "short": 1.0, "middle": 2.0}) == {"long"}
+    assert tier.left_out({f"test_{k}": 0.09 for k in range(100)}) == set()
+    assert tier.left_out({"only": 19.0}) == set()
+    assert tier.left_out({"only": 21.0}) == {"only"}
+
+
+def test_what_is_essential_is_in_the_test_command() -> None:
+    """The gates above among them, however long they take."""
+    listed = [sys.executable, "-m", "pytest", "--collect-only", "-q", "tests/house/test_style.py"]
+
+    def collected(*options: str) -> int:
+        done = subprocess.run(
+            [*listed, *options], cwd=ROOT, capture_output=True, text=True, timeout=120, check=True
+        )
+        return done.stdout.count("::test_gate_passes[")
+
+    assert collected("--tier", "test") == collected() == len(_gates())
+    assert collected("--tier", "quick") < len(_gates())
