@@ -6,7 +6,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help setup demo quick test test-all durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel readers release clean sbom audit debian chaos
+.PHONY: help setup demo quick test nightly durations check mutants bench faults serving fuzz docs site fmt proto bundle build wheel readers release clean sbom audit debian chaos
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -54,7 +54,7 @@ endef
 test: $(VENV)/.dev  ## tests of every file, the gates of `check` among them; what CI runs | MINUTES_TEST min on two cores after setup
 	$(call run_tests,--tier test)
 
-test-all: $(VENV)/.dev  ## all tests: before a release, and after a change that reaches far | MINUTES_ALL min on two cores
+nightly: $(VENV)/.dev  ## all tests: each night, before a release, after a change that reaches far | MINUTES_ALL min on two cores
 	$(call run_tests,)
 
 durations: $(VENV)/.dev  ## all tests; measure anew what `quick` and `test` leave out | MINUTES_ALL min on two cores

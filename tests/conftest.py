@@ -1,6 +1,6 @@
 """Fixtures that every room's tests may use, tiers of tests, and the order of a parallel run.
 
-`make quick` and `make test` run a tier each, `make test-all` runs everything. A tier has of each
+`make quick` and `make test` run a tier each, `make nightly` runs everything. A tier has of each
 file the fastest tests until the file has used its time (`TIERS`); `make test` also has what is
 marked ``essential``. `make durations` runs all tests, measures them, and writes to
 `tests/durations.json` what each tier leaves out. A test that it does not know yet is in both tiers.

@@ -34,7 +34,7 @@ LANGUAGES = {"", "sh", "text", "python", "toml", "ini", "csv", "c"}
 
 NOT_RUN = {
     "chronyc", "docker build", "docker compose", "export", "ip", "kubectl apply",
-    "kubectl create", "make audit", "make quick", "make setup", "mkdir", "phc2sys", "pmc",
+    "kubectl create", "make audit", "make quick", "make setup", "make nightly", "mkdir", "phc2sys", "pmc",
     "pre-commit", "ptp4l", "rerun", "ros2 topic", "sudo pip", "sudo python3", "sudo rm",
     "sudo systemctl",
 }  # fmt: skip
@@ -184,6 +184,7 @@ def test_a_command_cannot_hide(page: str, said: str) -> None:
         ("docs/quick-start.md", "palpate record --views", "does not run it"),
         ("docs/quick-start.md", "rerun runs/demo/*.rrd", "does not run it"),
         (".ci/run", "make audit", "does not run it"),
+        (".ci/run", "make nightly", "does not run it"),
         ("tests/house/test_style.py", "make check", ""),
         ("tests/house/test_style.py", "make sbom", "does not run it"),
     ],
