@@ -53,6 +53,7 @@ from palpate_training.experiment.generate.pipeline import (
 )
 from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
 from palpate_training.experiment.generate.simulator import ExperimentSpec, Specimen
+from palpate_training.experiment.generate.trials import registration_errors
 from palpate_training.experiment.generate.workers import WorkerProcesses
 
 SPEC = ExperimentSpec(
@@ -333,6 +334,17 @@ def test_presses_at_random_are_executed_on_some_of_the_specimens(tmp_path: Path)
     assert moved.data.experiment.trajectories == data.trajectories
     apart_m = np.linalg.norm(moved.data.experiment.location[0] - data.location[0])
     assert 1e-5 < apart_m < 3e-3
+    # The same presses again, with locations that no registration error is in.
+    truly = replace(spec, exact_labels=True)
+    assert "exact_labels" not in spec.content()
+    shutil.copytree(tmp_path / "random" / STORE, tmp_path / "exact" / STORE)
+    exact = generate(tmp_path / "exact", truly, four, FemSimulator(), workers=1)
+    assert exact is not None
+    np.testing.assert_array_equal(exact.data.experiment.force, data.force)
+    errors = np.stack(list(registration_errors(four, spec.seed).values()))  # of both arms
+    missed = data.location - exact.data.experiment.location
+    off = np.linalg.norm(errors[:, data.row_unit] - missed, axis=-1).min(axis=0)
+    np.testing.assert_allclose(off, 0.0, atol=1e-8)
 
 
 def test_the_command_takes_points_a_seed_and_specimens(tmp_path: Path) -> None:

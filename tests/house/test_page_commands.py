@@ -34,8 +34,8 @@ LANGUAGES = {"", "sh", "text", "python", "toml", "ini", "csv", "c"}
 
 NOT_RUN = {
     "chronyc", "docker build", "docker compose", "export", "ip", "kubectl apply",
-    "kubectl create", "make audit", "make quick", "make setup", "make nightly", "mkdir", "phc2sys", "pmc",
-    "pre-commit", "ptp4l", "rerun", "ros2 topic", "sudo pip", "sudo python3", "sudo rm",
+    "kubectl create", "make audit", "make nightly", "make quick", "make setup", "mkdir", "phc2sys",
+    "pmc", "pre-commit", "ptp4l", "rerun", "ros2 topic", "sudo pip", "sudo python3", "sudo rm",
     "sudo systemctl",
 }  # fmt: skip
 """All that no test runs. A page says of each why, and which other program does, if one does."""

@@ -145,6 +145,14 @@ def data_generate(
             help="Of the registration alone: more presses by the robots of another experiment.",
         ),
     ] = None,
+    exact_labels: Annotated[
+        bool,
+        typer.Option(
+            "--exact-labels",
+            help="Contact locations are where the tip was, not where a robot with a registration "
+            "error believes it.",
+        ),
+    ] = False,
     indenter: IndenterOption = None,
     units: UnitsOption = None,
     units_each: Annotated[
@@ -240,6 +248,7 @@ def data_generate(
         units_each=units_each,
         seed=seed,
         registration_seed=registration_seed,
+        exact_labels=exact_labels,
         edge_m=edge_mm * 1e-3,
         layers=layers,
         strain_stiffening=strain_stiffening,

@@ -67,6 +67,8 @@ class ExperimentSpec:
         friction_coefficient: Between indenter and skin.
         registration_seed: Of the robots' registration; None = ``seed``. Experiments of the same
             specimens with the same one are by robots that stand equally wrong.
+        exact_labels: Contact locations are where the tip truly was, not where robots that stand
+            wrong believe it; they press as deep all the same.
         layers: Elements through the skin.
     """
 
@@ -85,6 +87,7 @@ class ExperimentSpec:
     strain_stiffening: float | None = None
     friction_coefficient: float | None = None
     registration_seed: int | None = None
+    exact_labels: bool = False
     layers: int = LAYERS
 
     def content(self) -> dict[str, Any]:
@@ -94,6 +97,7 @@ class ExperimentSpec:
             "paths": (),
             "presses": 0,
             "units_each": 0,
+            "exact_labels": False,
             "layers": LAYERS,
             **dict.fromkeys((*SKIN, "registration_seed")),
         }

@@ -210,6 +210,7 @@ class TrialTask:
         specimens: Those that execute it.
         measured: Names of those whose ideal counts are kept.
         errors_m: Registration error of that arm for each of them [m], shape (U, 3).
+        exact_labels: Contact locations are without it.
         clearance_m: How far from the skin its path starts [m].
         seed: Of the experiment.
     """
@@ -222,6 +223,7 @@ class TrialTask:
     specimens: tuple[Specimen, ...]
     measured: tuple[str, ...]
     errors_m: Floats
+    exact_labels: bool
     clearance_m: float
     seed: int
 
@@ -308,7 +310,7 @@ def _perform(
         counts=counts,
         tip=tip,
         read_electrodes=read,
-        registration_error_m=error,
+        registration_error_m=np.zeros(3) if task.exact_labels else error,
         contact_m=contact_m,
         length_m=np.floor(length_m / 1e-4 + 1e-6) * 1e-4,
         since_power_on_s=WARM_S,
@@ -396,6 +398,7 @@ def _tasks(
                 specimens[i].name for i in (who if spec.units_each else range(len(specimens)))
             ),
             errors_m=errors[plan.arm][np.array(who)],
+            exact_labels=spec.exact_labels,
             clearance_m=simulator.clearance_m,
             seed=spec.seed,
         )
