@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pty
 import select
@@ -18,6 +19,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, LinkError, StreamTimeout
@@ -86,6 +88,8 @@ def test_what_is_written_is_a_profile_of_what_was_probed(lab: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert "serial number 310042" in text, "what the device said of itself stands beside it"
     assert text.count("#") > 5
+    kept = profile.recorder
+    assert f"after {kept.keep_bytes / 2**30:g} GiB or {kept.keep_s / 86400:g} days" in text
     assert "palpate up --profile left.toml" in done.output
     assert "palpate tare wrench --station left" in done.output
 
@@ -451,6 +455,19 @@ def test_without_a_force_sensor_it_says_so_and_all_ends_with_it(
         process.send_signal(signal.SIGKILL)
         process.wait()
     wait_until(lambda: not process_ids(runs), PATIENCE_S, "every process of the station ended")
+
+
+def test_a_narrow_terminal_shows_every_stream_and_value() -> None:
+    """Only the last column folds; before, the others had no room at all at 80 columns."""
+    seen = first_hour._Seen(MagicMock())
+    seen.counts["features"] = 1000
+    said = "+1.00 -2.00 +3.00 N, how far off is not known, by features-twin:12, UNCALIBRATED"
+    seen.texts["features"] = said
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(seen.table(10.0))
+    shown = console.export_text()
+    assert "…" not in shown
+    assert {"electrodes", "wrench", "pose", "features", "100", *said.split()} <= set(shown.split())
 
 
 class TestZero:

@@ -255,7 +255,8 @@ class _Seen:
         """All streams, with their rates over so many seconds."""
         table = Table()
         for column in ("stream", "Hz", "now"):
-            table.add_column(column, no_wrap=True)
+            # One that may not fold takes its room from the others, down to nothing.
+            table.add_column(column, no_wrap=column != "now", overflow="fold")
         for name, count in self.counts.items():
             table.add_row(name, f"{count / max(seconds, _POLL_S):.0f}", cell(self.texts[name]))
         return table
