@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import pty
@@ -23,6 +24,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, LinkError, StreamTimeout
+from palpate.messages import ModelInventory, QualityFlag, ServedModel
 from palpate_deploy.cli.app import app
 from palpate_deploy.station import first_hour, new_station
 from palpate_deploy.station import tare as tare_module
@@ -468,6 +470,44 @@ def test_a_narrow_terminal_shows_every_stream_and_value() -> None:
     shown = console.export_text()
     assert "…" not in shown
     assert {"electrodes", "wrench", "pose", "features", "100", *said.split()} <= set(shown.split())
+
+
+@pytest.mark.parametrize(
+    ("flags", "calibrated"), [((), True), ((QualityFlag.UNCALIBRATED,), False)]
+)
+def test_only_a_bundle_that_was_made_for_this_finger_keeps_it_from_being_calibrated(
+    lab: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    flags: tuple[QualityFlag, ...],
+    calibrated: bool,
+) -> None:
+    """The station remembers the bundle of a finger that was exchanged since."""
+    run("--biotac", VIRTUAL)
+    own = ServedModel("finger", "features-bt-a", 1, bytes(32), 0)
+    estimate = SimpleNamespace(message=SimpleNamespace(quality=flags))
+    session = MagicMock()
+    session.subscriber().__enter__().next.return_value = estimate
+    tare = SimpleNamespace(sensor_serial="BT-B", frames_averaged=9, electrodes_sd=np.ones(19))
+    stubs: dict[str, Any] = {
+        "_running": lambda *_: contextlib.nullcontext(),
+        "join": lambda *_, **__: contextlib.nullcontext(session),
+        "tare_at_rest": lambda *_, **__: tare,
+        "look": MagicMock(),
+        "read_token": MagicMock(),
+        "ModelAdmin": lambda *_: MagicMock(
+            served=lambda _: [ModelInventory("features", [own], ())]
+        ),
+        "_tell_estimate": MagicMock(),
+        "calibrate_finger": MagicMock(),
+    }
+    for name, stub in stubs.items():
+        monkeypatch.setattr(first_hour, name, stub)
+    first_hour.walk(first_hour.WalkOrder(lab / "lab.toml", 6, 0.0, lab))
+    assert stubs["calibrate_finger"].called is not calibrated
+    said = capsys.readouterr().out
+    assert ("calibrated already: features-bt-a:1" in said) is calibrated
+    assert ("features-bt-a:1 was not made for this finger, BT-B" in said) is not calibrated
 
 
 class TestZero:
