@@ -129,6 +129,7 @@ class RosBridge:
     def __init__(self, session: Session, config: RosBridgeConfig) -> None:
         self._session, self._config = session, config
         self._sensors: dict[str, str] = {}
+        self._named = {*config.sensors, *config.frame_ids}
         self._came: set[str] = set()
         self._first_s = 0.0
         self._clash: tuple[float, ConfigError] | None = None
@@ -146,7 +147,7 @@ class RosBridge:
         """
         if not self._came:
             self._first_s = time.monotonic()
-        if len(self._came) < _SENSORS_MAX:
+        if len(self._came) < _SENSORS_MAX or sample.sensor in self._named:
             self._came.add(sample.sensor)
         wanted = self._config.sensors
         if wanted and sample.sensor not in wanted:
@@ -174,7 +175,7 @@ class RosBridge:
         now_s = time.monotonic()
         if self._clash is not None and now_s - self._clash[0] < _CLASH_S:
             return self._clash[1]
-        absent = sorted({*self._config.sensors, *self._config.frame_ids} - self._came)
+        absent = sorted(self._named - self._came)
         if not (absent and self._came) or now_s - self._first_s < _ABSENT_S:
             return None
         return ConfigError(

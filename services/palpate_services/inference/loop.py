@@ -223,7 +223,7 @@ class EstimatePublisher(Generic[M, E]):
         self._used: set[str] = set()
         self._answered: ReceivedMessage[M] | None = None
         self._counts: Counter[str] = Counter()
-        self._strange = False
+        self._exchanged = False
         self._input = InputReport(health, _ERRORS, partial(show, models, health))
         self._stages = StageGauges()
         self._latencies_ns: list[int] = []
@@ -259,7 +259,7 @@ class EstimatePublisher(Generic[M, E]):
                     self._input.answered(sensor)  # it would have been
                 elif runtime is not None:
                     serial = getattr(received.message, "sensor_serial", "")
-                    self._strange |= self._models.meet(sensor, serial)
+                    self._exchanged |= self._models.meet(sensor, serial)
                     taken = _Taken(received, sample, taken_ns, time.monotonic_ns())
                     samples.setdefault(runtime, []).append(taken)
                 if len(messages) > 1:
@@ -385,8 +385,8 @@ class EstimatePublisher(Generic[M, E]):
         now_ns = time.monotonic_ns()
         if not last and now_ns - self._told_ns >= _TELL_PERIOD_NS:
             self._told_ns = now_ns
-            if self._strange:
-                self._strange = False
+            if self._exchanged:
+                self._exchanged = False
                 show(self._models, self._health)
             self._input.report()
         period_ns = now_ns - self._gauged_ns

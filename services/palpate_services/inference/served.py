@@ -133,6 +133,7 @@ class ServedModels:
         self._changing = threading.Lock()
         self._problems: dict[str, PalpateError] = {}
         self._serials: dict[str, str] = {}
+        """The finger that each sensor with a bundle of its own was, when it sent last."""
         self._owed: dict[str, ModelAction] = {}
         """The last command to each sensor that took effect and could not be remembered."""
         wanted = {DEFAULT: config.bundle, **config.bundles}
