@@ -72,7 +72,10 @@ DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
 class StrictConfig(BaseModel):
     """Base of all configuration: immutable, and an unknown key is an error."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", str_strip_whitespace=True)
+    # ``constants``: pydantic makes None of infinity and NaN else, where a key has no type.
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", str_strip_whitespace=True, ser_json_inf_nan="constants"
+    )
 
 
 class Role(StrEnum):

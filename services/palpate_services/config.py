@@ -42,6 +42,10 @@ class ModelsConfig(StrictConfig):
         """What is remembered, and the token."""
         return state_folder() if self.state is None else self.state
 
+    def served_file(self, station: str, task: str, instance: str) -> Path:
+        """What a service of a station remembers that it serves."""
+        return self.memory_folder / "stations" / station / f"{task}.{instance}.json"
+
 
 class EstimatingConfig(StrictConfig):
     """What all estimating services have in common.

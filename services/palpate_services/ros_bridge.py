@@ -9,6 +9,7 @@ clock of the frame's first slot and the sensor frame. No ROS is needed on this s
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -42,6 +43,16 @@ NODE = "palpate"
 _WAIT_S = 0.2
 _SENSORS_MAX = 256
 """Names come from other processes, and each takes publishers."""
+
+_TELL_S = 0.2
+_ABSENT_S = 5.0
+"""A named sensor of which nothing comes for so long after the first message of another one is a
+trouble [s]: until then a station starts."""
+
+_CLASH_S = 2.0
+"""So long after its last message a sensor of a taken name is a trouble [s]."""
+
+_SHOWN = 8
 
 _NAN = math.nan
 
@@ -86,18 +97,20 @@ def run_ros_bridge(
             avoid_pauses()
             health.set_state(ServiceState.READY)
             presence.ready()
+            told_s, lost = 0.0, False
             while not stop.is_set():
                 beat()
-                try:
-                    sample = tap.next(_WAIT_S)
-                except StreamTimeout:
+                with contextlib.suppress(StreamTimeout):
+                    health.count(bridge.pass_on(tap.next(_WAIT_S)))
+                    health.worked()
+                if time.monotonic() - told_s < _TELL_S:
                     continue
-                try:
-                    health.count(bridge.pass_on(sample))
-                except ConfigError as error:
-                    health.count("same_name")
-                    health.fail(error, degraded=False)  # the others go on
-                health.worked()
+                told_s = time.monotonic()
+                if (trouble := bridge.trouble()) is not None:
+                    health.fail(trouble)
+                elif lost:
+                    health.set_state(ServiceState.READY)
+                lost = trouble is not None
             presence.not_ready()
             health.set_state(ServiceState.STOPPING)
 
@@ -116,6 +129,10 @@ class RosBridge:
     def __init__(self, session: Session, config: RosBridgeConfig) -> None:
         self._session, self._config = session, config
         self._sensors: dict[str, str] = {}
+        self._named = {*config.sensors, *config.frame_ids}
+        self._came: set[str] = set()
+        self._first_s = 0.0
+        self._clash: tuple[float, ConfigError] | None = None
         for sensor in config.sensors:
             self._name_of(sensor)
         self._node = RosNode(session.zid, NODE, config.domain)
@@ -125,17 +142,23 @@ class RosBridge:
     def pass_on(self, sample: TapSample) -> str:
         """Publish what a message of the station holds; the counter that counts it.
 
-        ``passed_on``, ``not_followed`` (of another sensor), ``rejected_...``.
-
-        Raises:
-            ConfigError: Its sensor has the name of another one in ROS; nothing is published.
+        ``passed_on``, ``not_followed`` (of another sensor), ``same_name`` (its sensor has the name
+        of another one in ROS, so that nothing is published), ``rejected_...``.
         """
+        if not self._came:
+            self._first_s = time.monotonic()
+        if len(self._came) < _SENSORS_MAX or sample.sensor in self._named:
+            self._came.add(sample.sensor)
         wanted = self._config.sensors
         if wanted and sample.sensor not in wanted:
             return "not_followed"
         if sample.sensor not in self._sensors.values() and len(self._sensors) >= _SENSORS_MAX:
             return "not_followed"
-        self._name_of(sample.sensor)
+        try:
+            self._name_of(sample.sensor)
+        except ConfigError as error:  # the others go on
+            self._clash = time.monotonic(), error
+            return "same_name"
         topic = FEATURES if sample.topic == FEATURES.name else WRENCH
         try:
             message = topic.codec.decode(sample.payload)
@@ -146,6 +169,20 @@ class RosBridge:
             payload = layouts.encode(output.fields, output.layout)
             self._publisher(sample.sensor, output).put(payload)
         return "passed_on"
+
+    def trouble(self) -> ConfigError | None:
+        """What ROS should get and does not; None = nothing is lost."""
+        now_s = time.monotonic()
+        if self._clash is not None and now_s - self._clash[0] < _CLASH_S:
+            return self._clash[1]
+        absent = sorted(self._named - self._came)
+        if not (absent and self._came) or now_s - self._first_s < _ABSENT_S:
+            return None
+        return ConfigError(
+            f"nothing of {_listed(absent)} comes; there are: {_listed(sorted(self._came))}",
+            remedy="correct the names in ros_bridge.sensors and ros_bridge.frame_ids, or see why "
+            "the sensor is silent: palpate status",
+        )
 
     def _name_of(self, sensor: str) -> str:
         """Name of a sensor in ROS, where names have no '-' and do not begin with a digit."""
@@ -179,6 +216,12 @@ class RosBridge:
         for publisher in self._publishers.values():
             publisher.close()
         self._node_token.close()
+
+
+def _listed(sensors: Sequence[str]) -> str:
+    """The first of some names, and how many there are beside them."""
+    more = f" and {len(sensors) - _SHOWN} more" if len(sensors) > _SHOWN else ""
+    return ", ".join(map(repr, sensors[:_SHOWN])) + more
 
 
 class _RosPublisher:

@@ -109,6 +109,15 @@ class TestPresses:
         assert not counter.pressed
 
 
+def test_the_table_says_that_it_counts_what_was_recorded() -> None:
+    """A knock, or a press before the tare, is learned from and not counted by the guide."""
+    console = Console(width=80, record=True, file=io.StringIO())
+    names = ("force_magnitude_median_n", "force_angle_median_rad", "force_magnitude_p95_n")
+    metrics = dict.fromkeys((*names, "coverage_90"), 0.5)
+    calibrate._show(finger.FingerReport(bytes(32), "line", metrics, 7, 600), "x:1", console)
+    assert "7 presses recorded, each held out" in console.export_text()
+
+
 class Streams:
     """A session whose force presses for a second out of two, ``presses`` times."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import os
 import signal
@@ -12,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -19,7 +21,11 @@ from palpate.bus import Session
 from palpate.config import LinkConfig
 from palpate.errors import LinkError
 from palpate.files.bundle import read_bundle, write_bundle
+from palpate_deploy.diagnose import doctor
 from palpate_deploy.station import models
+from palpate_deploy.station.profile import load_profile, parse_profile
+from palpate_services.inference import remembered
+from palpate_services.inference.remembered import Remembered, RememberedFile
 from palpate_services.inference.repository import resolve
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -135,6 +141,56 @@ def test_a_station_that_trusts_a_key_imports_what_it_has_signed(
     done = palpate("model", "import", imported, "--profile", trusting)
     assert done.returncode == 0, done.stderr
     assert "mine:7" in palpate("model", "list").stdout
+
+
+def test_doctor_names_the_finger_that_the_remembered_bundle_was_made_for(
+    bundle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The profile names the shipped one; a command chose another, which is what will serve."""
+    shipped = read_bundle(resolve(bundle))
+    folder = tmp_path / "models" / "mine" / "1"
+    folder.parent.mkdir(parents=True)
+    write_bundle(
+        folder,
+        model=shipped.model,
+        golden=shipped.golden,
+        manifest=dataclasses.replace(
+            shipped.manifest, name="mine", version=1, sensor_serials=("BT-A",)
+        ),
+        known_inputs=shipped.known_inputs,
+    )
+
+    def found(serial: str) -> tuple[str, str]:
+        sensor = {"name": "finger", "driver": "biotac_can", "options": {"serial": serial}}
+        profile = parse_profile(
+            {
+                "features": {"bundle": bundle},
+                "gateway": {"sensors": [sensor]},
+                "models": {"folder": str(tmp_path / "models"), "state": str(tmp_path)},
+            },
+            where="test",
+        )
+        file = RememberedFile(profile.models.served_file("lab", "features", "features"))
+        assert file.recall({"": bundle}) in (None, chosen)
+        file.keep(chosen)
+        grade, said, _ = doctor._bundle(profile)
+        return grade, said
+
+    chosen = {
+        "": Remembered(bundle, shipped.sha256),
+        "finger": Remembered("mine:1", b"", changed=True),
+    }
+    assert found("BT-A") == ("ok", f"{bundle}:{shipped.manifest.version}, mine:1 reproduce their "
+                             "golden vectors")  # fmt: skip
+    grade, said = found("BT-B")
+    assert grade == "warn"
+    assert "finger has mine:1 (made for BT-A; this is BT-B)" in said
+    chosen["finger"] = Remembered("", b"", "mine:1", b"", changed=True)  # it was unloaded
+    (tmp_path / "stations/lab/features.features.json").unlink()
+    assert found("BT-B")[0] == "ok"
+    refused = OSError(errno.EACCES, "Permission denied")
+    monkeypatch.setattr(remembered, "read_regular", MagicMock(side_effect=refused))
+    assert doctor._served(load_profile("virtual"), "features", {"": "x"}) == {"": "x"}
 
 
 def test_a_broken_bundle_is_not_imported(palpate: Palpate, imported: Path) -> None:

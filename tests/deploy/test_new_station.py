@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import pty
 import select
@@ -18,9 +20,11 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, LinkError, StreamTimeout
+from palpate.messages import ModelInventory, QualityFlag, ServedModel
 from palpate_deploy.cli.app import app
 from palpate_deploy.station import first_hour, new_station
 from palpate_deploy.station import tare as tare_module
@@ -86,6 +90,8 @@ def test_what_is_written_is_a_profile_of_what_was_probed(lab: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert "serial number 310042" in text, "what the device said of itself stands beside it"
     assert text.count("#") > 5
+    kept = profile.recorder
+    assert f"after {kept.keep_bytes / 2**30:g} GiB or {kept.keep_s / 86400:g} days" in text
     assert "palpate up --profile left.toml" in done.output
     assert "palpate tare wrench --station left" in done.output
 
@@ -451,6 +457,57 @@ def test_without_a_force_sensor_it_says_so_and_all_ends_with_it(
         process.send_signal(signal.SIGKILL)
         process.wait()
     wait_until(lambda: not process_ids(runs), PATIENCE_S, "every process of the station ended")
+
+
+def test_a_narrow_terminal_shows_every_stream_and_value() -> None:
+    """Only the last column folds; before, the others had no room at all at 80 columns."""
+    seen = first_hour._Seen(MagicMock())
+    seen.counts["features"] = 1000
+    said = "+1.00 -2.00 +3.00 N, how far off is not known, by features-twin:12, UNCALIBRATED"
+    seen.texts["features"] = said
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(seen.table(10.0))
+    shown = console.export_text()
+    assert "…" not in shown
+    assert {"electrodes", "wrench", "pose", "features", "100", *said.split()} <= set(shown.split())
+
+
+@pytest.mark.parametrize(
+    ("flags", "calibrated"), [((), True), ((QualityFlag.UNCALIBRATED,), False)]
+)
+def test_only_a_bundle_that_was_made_for_this_finger_keeps_it_from_being_calibrated(
+    lab: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    flags: tuple[QualityFlag, ...],
+    calibrated: bool,
+) -> None:
+    """The station remembers the bundle of a finger that was exchanged since."""
+    run("--biotac", VIRTUAL)
+    own = ServedModel("finger", "features-bt-a", 1, bytes(32), 0)
+    estimate = SimpleNamespace(message=SimpleNamespace(quality=flags))
+    session = MagicMock()
+    session.subscriber().__enter__().next.return_value = estimate
+    tare = SimpleNamespace(sensor_serial="BT-B", frames_averaged=9, electrodes_sd=np.ones(19))
+    stubs: dict[str, Any] = {
+        "_running": lambda *_: contextlib.nullcontext(),
+        "join": lambda *_, **__: contextlib.nullcontext(session),
+        "tare_at_rest": lambda *_, **__: tare,
+        "look": MagicMock(),
+        "read_token": MagicMock(),
+        "ModelAdmin": lambda *_: MagicMock(
+            served=lambda _: [ModelInventory("features", [own], ())]
+        ),
+        "_tell_estimate": MagicMock(),
+        "calibrate_finger": MagicMock(),
+    }
+    for name, stub in stubs.items():
+        monkeypatch.setattr(first_hour, name, stub)
+    first_hour.walk(first_hour.WalkOrder(lab / "lab.toml", 6, 0.0, lab))
+    assert stubs["calibrate_finger"].called is not calibrated
+    said = capsys.readouterr().out
+    assert ("calibrated already: features-bt-a:1" in said) is calibrated
+    assert ("features-bt-a:1 was not made for this finger, BT-B" in said) is not calibrated
 
 
 class TestZero:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from pathlib import Path
 
@@ -167,3 +168,13 @@ def test_profile_survives_toml(name: str) -> None:
     profile = load_profile(name)
     text = tomli_w.dumps(plain_values(profile))
     assert parse_profile(tomllib.loads(text), where="text") == profile
+
+
+@pytest.mark.parametrize("odd", [math.inf, -math.inf, math.nan])
+def test_options_that_are_no_number_survive_toml_to_be_refused_by_name(odd: float) -> None:
+    """The driver says which one is wrong; before, nothing could write the profile down."""
+    options = {"rate_hz": odd, "mount": {"orientation_wxyz": [odd, 0, 0, 0]}}
+    sensor = {"name": "finger", "driver": "virtual", "options": options}
+    profile = parse_profile({"gateway": {"sensors": [sensor]}}, where="test")
+    read = tomllib.loads(tomli_w.dumps(plain_values(profile)))
+    assert repr(read["gateway"]["sensors"][0]["options"]) == repr(options)

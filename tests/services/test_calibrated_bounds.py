@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -42,9 +43,13 @@ SHIPPED = ("features-virtual", "features-twin")
 
 
 @contextlib.contextmanager
-def _served(link: LinkConfig, bundle: str, until: Until) -> Iterator[Session]:
+def _served(
+    link: LinkConfig, bundle: str, until: Until, own: dict[str, str] | None = None
+) -> Iterator[Session]:
     stop = threading.Event()
-    settings = FeaturesServiceConfig(bundle=bundle, unannounced=True, max_age_s=30.0)
+    settings = FeaturesServiceConfig(
+        bundle=bundle, bundles=own or {}, unannounced=True, max_age_s=30.0
+    )
     node = threading.Thread(target=run_estimating, args=(settings, link, "lab", stop))
     node.start()
     try:
@@ -106,6 +111,36 @@ def test_every_estimate_of_a_real_sensor_says_that_it_is_uncalibrated(
                 assert ("uncalibrated" in plain(answer)["quality"]) is real
                 (ros,) = (one for one in outputs_of(answer, "finger") if one.name == "features")
                 assert (int(UNCALIBRATED) in list(ros.fields["quality"])) is real
+
+
+def test_the_status_names_both_fingers_where_one_has_the_bundle_of_another(
+    link: LinkConfig, make_frame: Frames, make_tare: Tares, until: Until
+) -> None:
+    """A finger was exchanged, and the station remembers the bundle of the one before."""
+    name = "features-virtual"
+    bundle = read_bundle(resolve(name)).manifest
+    label, made_for = f"{name}:{bundle.version}", bundle.sensor_serials[0]
+    tare = make_tare()
+    with (
+        _served(link, name, until, {"finger": name}) as session,
+        Client(link.connect[0], station="lab", timeout_s=20.0) as client,
+    ):
+        sequences = itertools.count(1)
+        frames, others = (session.publisher(ELECTRODES, sensor=one) for one in ("finger", "other"))
+
+        def said(serial: str, tare_id: int) -> str:
+            for sensor in ("finger", "other"):
+                own = dataclasses.replace(tare, sensor_serial=serial, tare_id=tare_id)
+                session.publisher(TARE, sensor=sensor).put(own)
+            frame = make_frame(next(sequences), tare_id=tare_id)
+            for publisher in (frames, others):
+                publisher.put(dataclasses.replace(frame, sensor_serial=serial))
+            (status,) = client.status()
+            return status.message
+
+        both = f"serving {label}, finger {label} (made for {made_for}; this is BT1)"
+        until(lambda: said("BT1", 5) == both)
+        until(lambda: said(_own_serial(name), 6) == f"serving {label}, finger {label}")
 
 
 def test_a_drawn_specimen_is_another_sensor_than_the_three_that_ship(

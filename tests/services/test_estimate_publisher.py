@@ -99,7 +99,9 @@ class Station:
             FeaturesServiceConfig(**given),
             health,  # type: ignore[arg-type]
             SimpleNamespace(
-                describe=str, of=lambda sensor: self.runtimes.get(sensor, self.runtime)
+                describe=str,
+                of=lambda sensor: self.runtimes.get(sensor, self.runtime),
+                meet=lambda *_: False,
             ),  # type: ignore[arg-type]
             Estimation(self.sample, lambda frame, *_: frame.stamp.sequence),
             rate_hz=rate_hz,

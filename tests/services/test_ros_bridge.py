@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import threading
+import time
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,9 +22,18 @@ from palpate.bus import ForeignSubscriber, Session
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError, StreamTimeout
-from palpate.messages import FeatureEstimate, Origin, QualityFlag, Stamp, Status, WrenchFrame
+from palpate.messages import (
+    FeatureEstimate,
+    Origin,
+    QualityFlag,
+    ServiceState,
+    Stamp,
+    Status,
+    WrenchFrame,
+)
 from palpate.ros.layouts import DEFINITIONS
 from palpate.ros.layouts import FEATURES as FEATURES_LAYOUT
+from palpate_services import ros_bridge
 from palpate_services.config import RosBridgeConfig
 from palpate_services.ros_bridge import run_ros_bridge
 
@@ -215,21 +225,57 @@ def test_a_later_sensor_of_a_taken_name_in_ros_is_not_mixed_in_and_told(
         second = session.publisher(FEATURES, sensor="f_1")
         assert received(session, {"force": force}, lambda: first.put(estimate()))
 
-        def status() -> Status:
-            (found,) = [one for one in robot.status() if one.service == "ros_bridge"]
-            return found
-
         def told() -> bool:
             second.put(estimate())
-            return status().counters.get("same_name", 0) > 0
+            return status(robot).state is ServiceState.DEGRADED
 
         until(told)
-        error = status().last_error
+        assert status(robot).counters["same_name"] > 0
+        error = status(robot).last_error
         assert error is not None
         assert "'f-1' and 'f_1'" in error.message
         while force.waiting:
             got = WrenchStamped.deserialize(force.next(0.0).payload)
             assert got.header.frame_id == "f-1"
+
+
+def status(robot: Client) -> Status:
+    """That of the bridge."""
+    (found,) = [one for one in robot.status() if one.service == "ros_bridge"]
+    return found
+
+
+@pytest.mark.parametrize("config", [{"sensors": ("thumb",)}, {"frame_ids": {"thumb": "tip"}}])
+def test_a_named_sensor_of_which_nothing_comes_is_told_until_it_comes(
+    link: LinkConfig, until: Until, monkeypatch: pytest.MonkeyPatch, config: dict[str, Any]
+) -> None:
+    """Before, everything was ready, and not one message came in ROS."""
+    monkeypatch.setattr(ros_bridge, "_ABSENT_S", 0.3)
+    with bridge(link, until, **config) as session, Client(link.connect[0]) as robot:
+        finger = session.publisher(FEATURES, sensor="finger")
+        thumb = session.publisher(FEATURES, sensor="thumb")
+
+        def told() -> bool:
+            finger.put(estimate())
+            return status(robot).state is ServiceState.DEGRADED
+
+        until(told)
+        assert status(robot).message == "nothing of 'thumb' comes; there are: 'finger'"
+
+        def over() -> bool:
+            thumb.put(estimate())
+            return status(robot).state is ServiceState.READY
+
+        until(over)
+
+
+def test_a_station_that_sends_nothing_yet_is_no_trouble(
+    link: LinkConfig, until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ros_bridge, "_ABSENT_S", 0.0)
+    with bridge(link, until, sensors=("thumb",)), Client(link.connect[0]) as robot:
+        time.sleep(0.6)
+        assert status(robot).state is ServiceState.READY
 
 
 def test_humble_has_no_type_hash(link: LinkConfig, until: Until) -> None:

@@ -89,6 +89,26 @@ def test_the_profile_chooses_for_all_and_for_single_sensors(service: Service) ->
     assert started.metadata().version == 3
 
 
+def test_a_sensor_with_the_bundle_of_another_finger_is_told(
+    service: Service, models: Path, make_bundle: Make
+) -> None:
+    for name, serials in (("mine", ("BT-A",)), ("many", ("BT-A", "BT-B", "BT-C")), ("old", ())):
+        shutil.copytree(make_bundle(name=name, sensor_serials=serials), models / name / "1")
+    started = service(bundles={"thumb": "mine"})
+    assert not started.meet("finger", "BT-X"), "it has no bundle of its own"
+    assert started.meet("thumb", "BT-B")
+    assert not started.meet("thumb", "BT-B")
+    assert started.describe() == "serving x:1, thumb mine:1 (made for BT-A; this is BT-B)"
+    do(started, LOAD, "many", "thumb")
+    assert started.describe() == "serving x:1, thumb many:1"
+    assert started.meet("thumb", "BT-X")
+    assert "many:1 (made for BT-A and 2 more; this is BT-X)" in started.describe()
+    do(started, LOAD, "old", "thumb")
+    assert started.describe() == "serving x:1, thumb old:1", "it names nobody"
+    do(started, UNLOAD, sensor="thumb")
+    assert started.describe() == "serving x:1"
+
+
 def test_a_profile_that_names_a_bundle_of_another_task_is_wrong() -> None:
     settings = FeaturesServiceConfig(bundle="field-twin")
     with pytest.raises(

@@ -18,7 +18,7 @@ from typing import Literal
 from rich.console import Console
 
 from palpate.config import endpoint_host_port, is_loopback
-from palpate.errors import LinkError, PalpateError
+from palpate.errors import ConfigError, LinkError, PalpateError
 from palpate.process import state_folder
 from palpate_deploy.station.host import check_free, join
 from palpate_deploy.station.logs import FAILED
@@ -205,10 +205,10 @@ def _bundle(profile: Profile) -> Found:
         "synthesis": profile.synthesis,
     }
     served = [
-        (task, name)
+        (task, sensor, bundle)
         for task, table in tables.items()
         if task in profile.processes
-        for name in dict.fromkeys([table.bundle, *table.bundles.values()])
+        for sensor, bundle in _served(profile, task, {"": table.bundle, **table.bundles}).items()
     ]
     if not served:
         return "ok", "no service of this profile needs one", ""
@@ -217,12 +217,39 @@ def _bundle(profile: Profile) -> Found:
     from palpate_services.inference.trial import proven
 
     repository = Repository.of_config(profile.models)
-    names = []
-    for task, name in served:
-        manifest = load(proven(repository.read(repository.resolve(name)), task), task).manifest
-        names.append(f"{manifest.name}:{manifest.version}")
+    serials = {one.name: one.options.get("serial") for one in profile.gateway.sensors}
+    loaded = {
+        (task, bundle): load(proven(repository.read(repository.resolve(bundle)), task), task)
+        for task, bundle in dict.fromkeys((task, bundle) for task, _, bundle in served)
+    }
+    names = [runtime.label for runtime in loaded.values()]
+    strange = [
+        f"{sensor} has {loaded[task, bundle].label}{others}"
+        for task, sensor, bundle in served
+        if (serial := serials.get(sensor))
+        and (others := loaded[task, bundle].made_for_others(str(serial)))
+    ]
     what = "reproduces its golden vectors" if len(names) == 1 else "reproduce their golden vectors"
-    return "ok", f"{', '.join(names)} {what}", ""
+    found = f"{', '.join(names)} {what}"
+    if strange:
+        fix = "palpate calibrate this finger, or palpate model load the bundle that was made for it"
+        return "warn", f"{found}; {', '.join(strange)}", fix
+    return "ok", found, ""
+
+
+def _served(profile: Profile, task: str, named: dict[str, str]) -> dict[str, str]:
+    """Bundles that a service would serve, by sensor: those that commands chose count."""
+    from palpate_services.inference.remembered import RememberedFile
+
+    file = profile.models.served_file(profile.station, task, profile.instance(task))
+    try:
+        chosen = RememberedFile(file).recall(named) or {}
+    except ConfigError as error:
+        if not isinstance(error.__cause__, PermissionError):
+            raise
+        chosen = {}  # an installed station's own, which its user alone may read
+    served = named | {sensor: one.bundle for sensor, one in chosen.items() if one.changed}
+    return {sensor: bundle for sensor, bundle in served.items() if bundle}
 
 
 def _disk(profile: Profile) -> Found:

@@ -418,8 +418,9 @@ def _show(report: FingerReport, label: str, console: Console) -> None:
 
     found = report.metrics
     table = Table(title=label, title_justify="left")
-    of = f"{report.presses} presses, each held out" if report.presses else "on other fingers"
-    table.add_column(of)
+    # All that are in the record: the guide counts no short ones, and none before the tare.
+    count = report.presses
+    table.add_column(f"{count} presses recorded, each held out" if count else "on other fingers")
     table.add_column("magnitude [N]", justify="right")
     table.add_column("angle [rad]", justify="right")
     for words, prefix in (

@@ -1,7 +1,7 @@
 """The way from a profile to estimates of one's own finger: run, zero and tare, look, calibrate.
 
 Each step looks first whether it is done: a station that runs is used, and a finger that has a
-bundle of its own keeps it. So the walk can be broken off anywhere and taken again.
+bundle that was made for it keeps it. So the walk can be broken off anywhere and taken again.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from palpate.messages import (
     FeatureEstimate,
     FloatArray,
     IndenterPoseFrame,
+    QualityFlag,
     Tare,
     WrenchFrame,
 )
@@ -106,7 +107,11 @@ def walk(order: WalkOrder) -> None:
             )
             look(session, tare, order.look_s, console)
             own, measured = _own_bundle(session, profile), _has_wrench(session)
-        if own:
+            known = bool(own) and _knows_finger(session)
+        if own and not known:
+            serial = printable(tare.sensor_serial)
+            console.print(f"{own} was not made for this finger, {serial}", markup=False)
+        if known:
             console.print(f"calibrated already: {own}", markup=False)
         elif not measured:
             console.print(
@@ -255,7 +260,8 @@ class _Seen:
         """All streams, with their rates over so many seconds."""
         table = Table()
         for column in ("stream", "Hz", "now"):
-            table.add_column(column, no_wrap=True)
+            # One that may not fold takes its room from the others, down to nothing.
+            table.add_column(column, no_wrap=column != "now", overflow="fold")
         for name, count in self.counts.items():
             table.add_row(name, f"{count / max(seconds, _POLL_S):.0f}", cell(self.texts[name]))
         return table
@@ -315,6 +321,15 @@ def _own_bundle(session: Session, profile: Profile) -> str:
             if one.sensor == FINGER and one.name:
                 return f"{one.name}:{one.version}"
     return ""
+
+
+def _knows_finger(session: Session) -> bool:
+    """Whether the bundle that serves was made for this finger, by its serial number.
+
+    It may be that of another one, which had this name at the station before.
+    """
+    with session.subscriber(FEATURES, sensor=FINGER) as estimates:
+        return QualityFlag.UNCALIBRATED not in estimates.next(_ASK_S).message.quality
 
 
 def _has_wrench(session: Session) -> bool:

@@ -480,7 +480,7 @@ def profile_text(wanted: StationWanted, probed: Sequence[ProbedDevice]) -> str:
         "# Made for simulated fingers: flagged UNCALIBRATED on yours until `palpate calibrate`\n"
         "# has made and loaded a bundle of its own, which a station remembers.\n"
         'bundle = "features-twin"\n',
-        '[recorder]\n# The oldest records are removed after 20 GB or 14 days.\nout = "runs"\n',
+        '[recorder]\n# The oldest records are removed after 20 GiB or 14 days.\nout = "runs"\n',
     ]
     text = "\n".join(parts)
     parse_profile(tomllib.loads(text), where=str(wanted.path))

@@ -42,6 +42,10 @@ def is_measured(wrench: Sequence[float]) -> bool:
     return all(-_GARBAGE < value < _GARBAGE for value in wrench)
 
 
+_ARM_M = 1.0
+"""No finger is further from the sensor that measures its load [m]: a larger origin is in mm."""
+
+
 class MountOptions(StrictConfig):
     """How a force/torque sensor is mounted.
 
@@ -65,6 +69,11 @@ class MountOptions(StrictConfig):
             )
         if not all(math.isfinite(part) for part in self.origin_m):
             raise ValueError(f"origin_m {self.origin_m} is not finite")
+        if math.hypot(*self.origin_m) >= _ARM_M:
+            raise ValueError(
+                f"origin_m {self.origin_m} is {math.hypot(*self.origin_m):g} m from the finger: "
+                "give metres, not mm"
+            )
         return self
 
 

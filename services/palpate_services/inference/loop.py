@@ -223,6 +223,7 @@ class EstimatePublisher(Generic[M, E]):
         self._used: set[str] = set()
         self._answered: ReceivedMessage[M] | None = None
         self._counts: Counter[str] = Counter()
+        self._exchanged = False
         self._input = InputReport(health, _ERRORS, partial(show, models, health))
         self._stages = StageGauges()
         self._latencies_ns: list[int] = []
@@ -257,6 +258,8 @@ class EstimatePublisher(Generic[M, E]):
                     self._counts["standby"] += 1
                     self._input.answered(sensor)  # it would have been
                 elif runtime is not None:
+                    serial = getattr(received.message, "sensor_serial", "")
+                    self._exchanged |= self._models.meet(sensor, serial)
                     taken = _Taken(received, sample, taken_ns, time.monotonic_ns())
                     samples.setdefault(runtime, []).append(taken)
                 if len(messages) > 1:
@@ -382,6 +385,9 @@ class EstimatePublisher(Generic[M, E]):
         now_ns = time.monotonic_ns()
         if not last and now_ns - self._told_ns >= _TELL_PERIOD_NS:
             self._told_ns = now_ns
+            if self._exchanged:
+                self._exchanged = False
+                show(self._models, self._health)
             self._input.report()
         period_ns = now_ns - self._gauged_ns
         if last or period_ns >= _GAUGE_PERIOD_NS:
@@ -523,7 +529,7 @@ def _models(
     """The bundles of a service, and the token of those who may change them."""
     if kept is None:
         return ServedModels(task, config, Repository(None)), None
-    file = RememberedFile(kept.memory_folder / "stations" / station / f"{task}.{instance}.json")
+    file = RememberedFile(kept.served_file(station, task, instance))
     models = ServedModels(task, config, Repository.of_config(kept), file)
     try:
         return models, make_token(token_file(kept.memory_folder, station))

@@ -287,6 +287,17 @@ class Runtime:
             self._made_for[serial] = found
         return found
 
+    def made_for_others(self, serial: str) -> str:
+        """Which fingers it was made for, if not for this one, in words; empty = nothing is known.
+
+        A bundle that was made without presses of its finger names none.
+        """
+        known = self.manifest.sensor_serials
+        if not known or self.made_for(serial):
+            return ""
+        more = f" and {len(known) - 1} more" if len(known) > 1 else ""
+        return f" (made for {known[0]}{more}; this is {serial})"
+
     def bounds(
         self, size: float, place: Place | None, *, others: bool, contact: bool = True
     ) -> ErrorBounds | None:

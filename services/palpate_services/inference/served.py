@@ -132,6 +132,8 @@ class ServedModels:
         self._loading = threading.Lock()
         self._changing = threading.Lock()
         self._problems: dict[str, PalpateError] = {}
+        self._serials: dict[str, str] = {}
+        """The finger that each sensor with a bundle of its own was, when it sent last."""
         self._owed: dict[str, ModelAction] = {}
         """The last command to each sensor that took effect and could not be remembered."""
         wanted = {DEFAULT: config.bundle, **config.bundles}
@@ -172,6 +174,13 @@ class ServedModels:
     def of(self, sensor: str) -> Runtime | None:
         """The bundle of a sensor; None = there is none."""
         return self._serving.of(sensor)
+
+    def meet(self, sensor: str, serial: str) -> bool:
+        """Note which finger a sensor with a bundle of its own is; whether it is another one."""
+        if self._serials.get(sensor) == serial or sensor not in self._serving.assigned:
+            return False
+        self._serials[sensor] = serial
+        return True
 
     def all(self) -> list[Runtime]:
         """The bundles that serve, that of all other sensors first."""
@@ -289,11 +298,20 @@ class ServedModels:
         if self.standby:
             return self.standby
         names = [
-            f"{sensor} {_name(one.current)}" if sensor else _name(one.current)
+            f"{sensor} {_name(one.current)}{self._of_another(sensor, one.current)}"
+            if sensor
+            else _name(one.current)
             for sensor, one in sorted(self._serving.assigned.items())
             if one.current is not None or sensor == DEFAULT
         ]
         return f"serving {', '.join(names) or 'no bundle'}"
+
+    def _of_another(self, sensor: str, choice: Choice | None) -> str:
+        """That a sensor's own bundle was made for another finger, in words; empty = it was not."""
+        serial = self._serials.get(sensor)
+        if choice is None or choice.runtime is None or serial is None:
+            return ""
+        return choice.runtime.made_for_others(serial)
 
     def labels(self) -> tuple[str, ...]:
         """What is served, each bundle once as ``name:version``."""

@@ -266,7 +266,7 @@ class SynthesisRequests:
         if step.displacement is None:
             raise RemoteError(
                 "the finite-element service sent a step without its displacement",
-                remedy="upgrade it: palpate status shows versions",
+                remedy="upgrade it: palpate status --json shows versions",
                 code=ErrorCode.WRONG_CONTRACT,
             )
         now_ns, wall_ns = clock.now()

@@ -82,7 +82,7 @@ class OneReading(WrenchDevice):
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 3.3e38, -1e39, 1e300])
-@pytest.mark.parametrize("mount", [{}, {"origin_m": [0.0, 0.0, 100.0]}])
+@pytest.mark.parametrize("mount", [{}, {"origin_m": [0.0, 0.0, 0.9]}])
 def test_garbage_is_counted_and_dropped(mount: dict[str, Any], wrong: float) -> None:
     device = OneReading(mount=mount)
     assert device._reading((wrong, 2.0, 3.0, 0.1, 0.2, 0.3)) is None
@@ -100,6 +100,8 @@ def test_garbage_is_counted_and_dropped(mount: dict[str, Any], wrong: float) -> 
         ({"orientation_wxyz": [0.0, 0.0, 0.0, 0.0]}, "length 0, not 1"),
         ({"orientation_wxyz": [float("nan"), 0.0, 0.0, 0.0]}, "length nan"),
         ({"origin_m": [0.0, float("inf"), 0.0]}, "not finite"),
+        ({"origin_m": [50, 0, 0]}, r"origin_m \(50.0, 0.0, 0.0\) is 50 m .* metres, not mm"),
+        ({"origin_m": [0.0, 0.0, -1.0]}, "metres, not mm"),
         ({"carries": "cup"}, "carries"),
     ],
 )
