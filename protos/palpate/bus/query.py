@@ -309,7 +309,9 @@ def no_reply(
             f"or its answer is {_DROPPED}",
             remedy="ask again; if that fails, ask for less and look at the log of the service",
         )
-    if others := other_stations(alive([session], "*", timeout_s=LOOK_S), station):
+    with while_open():
+        others = other_stations(alive([session], "*", timeout_s=LOOK_S), station)
+    if others:
         return LinkError(
             f"no process of station {station!r} runs: nobody answers on {key}",
             remedy="name one of the stations that this router sees, --station or station=: "
