@@ -135,7 +135,7 @@ def screen(
     width: int,
     said: Expectation | None = None,
 ) -> Group:
-    """Everything of a station as one picture of ``width`` characters; ``said`` as `troubles`."""
+    """A station as one picture of ``width`` characters; ``said`` is for ``troubles``."""
     processes, sensors = process_activities(observed), sensor_activities(observed)
     found = troubles((one.report for one in observed), said)
     well = sum(one.state in ("ready", "routes", "finished") for one in processes)

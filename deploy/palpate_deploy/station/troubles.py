@@ -28,7 +28,7 @@ class Expectation:
     Attributes:
         source: In one line, who says so.
         processes: The processes that should run.
-        pid: Process id of the `palpate up` on this host that keeps them running; 0 = none is known.
+        pid: Process id of the ``palpate up`` that runs them on this host; 0 = none is known.
     """
 
     source: str

@@ -314,8 +314,8 @@ def no_reply(
     if others:
         return LinkError(
             f"no process of station {station!r} runs: nobody answers on {key}",
-            remedy="name one of the stations that this router sees, --station or station=: "
-            + ", ".join(others),
+            remedy="start it with `palpate up`, or name another one that this router sees, "
+            f"--station or station=: {', '.join(others)}",
         )
     if device:
         return LinkError(
