@@ -9,14 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from palpate.errors import ConfigError
 from palpate.messages import COUNTS_MAX
+from palpate_deploy.bench import alignment, codec, soak, swap
 from palpate_deploy.bench.e2e import Run
 from palpate_deploy.bench.e2e import _median as e2e_median
 from palpate_deploy.bench.fleet import _latency as fleet_latency
 from palpate_deploy.bench.harness import SourceGate, bench_counts, read_rows, write_rows
-from palpate_deploy.bench.results import Latency, append_history, latency, rounds
+from palpate_deploy.bench.results import Latency, append_history, finish, latency, rounds
+from palpate_deploy.cli.app import app
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -110,6 +113,40 @@ def test_history_is_kept_in_the_working_tree_only(
     (tmp_path / "tests" / "benchmarks").mkdir(parents=True)
     line = json.loads(append_history("codec", {"a": 1}).read_text(encoding="utf-8"))
     assert (line["benchmark"], line["a"]) == ("codec", 1)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("swap", "--out", "a-file/x.json"), "a-file is no folder"),
+        (("swap", "--out", "x.txt"), "does not end in .json"),
+        (("soak", "--out", "a-folder.json"), "is a folder"),
+        (("alignment", "--page", "a-file/x.md"), "a-file is no folder"),
+        (("codec", "--save"), "--save: "),
+    ],
+)
+def test_what_cannot_be_written_is_told_before_the_measurement(
+    words: tuple[str, ...], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a-file").touch()
+    Path("a-folder.json").mkdir()
+    for module, name in (
+        (alignment, "run_alignment"),
+        (codec, "run_codec"),
+        (soak, "run_soak"),
+        (swap, "run_swap"),
+    ):
+        monkeypatch.setattr(module, name, lambda *_, **__: pytest.fail("it measures"))
+    told = CliRunner().invoke(app, ["bench", *words])
+    assert told.exit_code == 2, told.output
+    assert says in " ".join(told.output.split())
+
+
+def test_a_result_makes_its_folder(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "folder" / "x.json"
+    finish("codec", {"a": 1}, lambda: None, as_json=False, save=False, out=out)
+    assert json.loads(out.read_text(encoding="utf-8"))["a"] == 1
 
 
 @pytest.mark.slow

@@ -119,6 +119,38 @@ def test_show_tells_role_name_hosts_and_end(lab: Path) -> None:
     assert 6.9 < end / datetime.timedelta(days=1) <= 7.0
 
 
+def test_a_damaged_certificate_hides_no_other(lab: Path) -> None:
+    (lab / "gateway" / "key.pem").unlink()
+    (lab / "service" / "cert.pem").unlink()
+    rows = {one["name"]: one for one in json.loads(_run("certs", "show", lab, "--json", code=1))}
+    assert rows["router"]["problem"] == ""
+    assert "key.pem does not exist" in rows["gateway"]["problem"]
+    assert "cert.pem does not exist" in rows["service"]["problem"]
+    assert rows["gateway"]["role"] is rows["gateway"]["until"] is None
+    shown = _run("certs", "show", lab, code=1)
+    assert all(name in shown for name in rows)
+    own = json.loads(_run("certs", "show", lab / "service", "--json", code=1))
+    assert own == [rows["service"]]
+
+
+def test_a_key_of_another_authority_issues_nothing(lab: Path, tmp_path: Path) -> None:
+    make_authority(tmp_path / "other")
+    shutil.copy(tmp_path / "other" / "ca.key", lab / "ca.key")
+    said = " ".join(_run("certs", "issue", lab, "--role", "operator", code=2).split())
+    assert "ca.key is not the key of" in said
+    assert not (lab / "operator").exists()
+    (lab / "ca.key").write_text("no key")
+    said = " ".join(_run("certs", "issue", lab, "--role", "operator", code=2).split())
+    assert "no private key" in said
+    assert "palpate certs ca NEW-FOLDER" in said
+
+
+def test_one_that_does_not_hold_when_it_is_issued_is_told(lab: Path) -> None:
+    before = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=3)
+    with mock.patch.object(certificates, "_now", return_value=before):
+        assert "check the clock" in _run("certs", "issue", lab, "--role", "robot", code=1)
+
+
 def test_a_certificate_ends_with_its_authority(tmp_path: Path) -> None:
     make_authority(tmp_path / "lab", days=3)
     made = issue(tmp_path / "lab", Role.ROBOT, days=365)

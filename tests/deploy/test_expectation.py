@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import socket
 from pathlib import Path
 
 import pytest
 
-from palpate.census import SUPERVISOR
-from palpate.config import LinkConfig
+from palpate.bus.no_router import RouterAbsent
+from palpate.census import SUPERVISOR, ProcessReport
+from palpate.config import LinkConfig, endpoint_host_port
 from palpate.errors import ConfigError, LinkError
 from palpate_deploy.station.host import (
     free_endpoint,
@@ -22,6 +24,7 @@ from palpate_deploy.station.troubles import (
     expectation,
     expectation_here,
     expectation_of,
+    troubles,
 )
 
 PROCESSES = ["router", "gateway", "features"]
@@ -91,6 +94,46 @@ def test_a_router_that_should_answer_is_not_said_to_be_absent() -> None:
     with pytest.raises(LinkError, match="does not answer, but should") as hangs:
         ask_through_router(link, "lab", expectation_here([here], "lab"))
     assert "by itself" in hangs.value.remedy
+
+
+def test_a_station_that_only_a_profile_knows_does_not_run() -> None:
+    here = free_endpoint()
+    link = LinkConfig(connect=(here,), wait_for_router_s=0.3)
+    with pytest.raises(RouterAbsent, match="the station of profile virtual does not run") as absent:
+        ask_through_router(link, "lab", expectation(link, "lab", "virtual"))
+    assert "palpate up" in absent.value.remedy
+    assert "systemctl start" in absent.value.remedy
+    with socket.create_server(("127.0.0.1", endpoint_host_port(here)[1])):
+        with pytest.raises(LinkError, match="something listens"):
+            ask_through_router(link, "lab", expectation(link, "lab", "virtual"))
+        a_run(here)
+        with pytest.raises(LinkError, match="does not answer, but should"):
+            ask_through_router(link, "lab", expectation(link, "lab", "virtual"))
+
+
+def test_a_listener_with_certificates_is_not_said_to_hang() -> None:
+    here = free_endpoint()
+    link = LinkConfig(connect=(here,), wait_for_router_s=0.3)
+    path = a_run(here) / "profile.toml"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("tcp/", "tls/"), encoding="utf-8")
+    with (
+        socket.create_server(("127.0.0.1", endpoint_host_port(here)[1])),
+        pytest.raises(LinkError, match="something listens") as told,
+    ):
+        ask_through_router(link, "lab", expectation(link, "lab", None))
+    assert "connect to tls/127.0.0.1:" in told.value.remedy
+
+
+def test_a_supervisor_that_is_stopped_runs() -> None:
+    here = free_endpoint()
+    census = [ProcessReport(*SUPERVISOR, alive=False, ready=False, status=None)]
+    (gone,) = troubles(census)
+    assert gone.problem == "does not run"
+    a_run(here)
+    (stopped,) = troubles(census, expectation(LinkConfig(connect=(here,)), "lab", "virtual"))
+    assert stopped.problem == f"runs as process {os.getpid()} and cannot be reached"
+    assert f"kill -CONT {os.getpid()}" in stopped.remedy
 
 
 def test_a_supervisor_that_hangs_is_missed_beside_a_named_profile() -> None:

@@ -21,6 +21,7 @@ from palpate.bus import Session
 from palpate.census import ProcessReport
 from palpate.codec import STATUS
 from palpate.config import LinkConfig
+from palpate.errors import LinkError
 from palpate.health import Health, HealthReporter
 from palpate.messages import (
     GAUGE_MAX,
@@ -34,7 +35,8 @@ from palpate.messages import (
 from palpate_deploy.station import observation
 from palpate_deploy.station.activity import DropCount, process_activities, sensor_activities
 from palpate_deploy.station.observation import ObservedProcess, StationObserver
-from palpate_deploy.station.status import _print, shown_counters
+from palpate_deploy.station.status import _print, show_status, shown_counters
+from palpate_deploy.station.tare import take_tare
 from palpate_deploy.station.top import _as_json, run_top, screen
 from palpate_deploy.station.web.snapshot import snapshot
 from palpate_services.inference.estimates import EstimateRefusal
@@ -303,6 +305,20 @@ def test_one_picture_for_scripts(
     assert run_top(link, "lab", once=True) == 0
     assert "features" in capsys.readouterr().out
     assert run_top(link, "elsewhere", once=True) == 1
+    assert "no process of station 'elsewhere' runs" in capsys.readouterr().out
+
+
+def test_a_wrong_station_is_told_which_are_there(
+    services: dict[str, tuple[Session, Health]],
+    link: LinkConfig,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for look in (partial(run_top, once=True), partial(show_status, as_json=False)):
+        assert look(link, "elsewhere") == 1
+        assert "--station lab" in capsys.readouterr().out
+    with pytest.raises(LinkError, match="no process of station 'elsewhere' runs") as told:
+        take_tare(link, "elsewhere", "finger", frames=2, timeout_s=5.0)
+    assert told.value.remedy.endswith("--station or station=: lab")
 
 
 def test_it_ends_with_q(services: dict[str, tuple[Session, Health]], link: LinkConfig) -> None:

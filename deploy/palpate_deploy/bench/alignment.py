@@ -37,7 +37,7 @@ from palpate_deploy.bench.alignment_parts import (
     time_of,
 )
 from palpate_deploy.bench.harness import received
-from palpate_deploy.bench.results import finish, machine, progress_bar
+from palpate_deploy.bench.results import finish, machine, progress_bar, write_result
 from palpate_deploy.bench.station import free_port, gateway_station, wait_ready
 from palpate_deploy.station.host import join, write_profile
 from palpate_deploy.station.processes import FiniteRun, command_line
@@ -257,7 +257,7 @@ def run_alignment(
         "alignment.goal_met": all(one.p95_s <= GOAL_S for one in result.apart.values()),
     }
     if page is not None:
-        page.write_text(page_of(result, machine()), encoding="utf-8")
+        write_result(page, page_of(result, machine()))
     finish("alignment", values, lambda: _print(result), as_json=as_json, save=save)
 
 

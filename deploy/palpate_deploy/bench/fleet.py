@@ -31,7 +31,7 @@ from palpate.config import Role
 from palpate.errors import LinkError
 from palpate_deploy.bench.harness import read_rows
 from palpate_deploy.bench.hosts import HostLab, LabHost
-from palpate_deploy.bench.results import finish, machine
+from palpate_deploy.bench.results import finish, machine, write_result
 from palpate_deploy.station.certificates import issue, make_authority
 from palpate_deploy.station.lifetime import start_child, stop_child
 
@@ -507,7 +507,7 @@ def run_fleet(
 def _keep(values: dict[str, Any], out: Path | None) -> None:
     """Write what is known so far: a measurement that breaks off leaves that."""
     if out is not None:
-        out.write_text(json.dumps({**values, "machine": machine()}, indent=2) + "\n", "utf-8")
+        write_result(out, json.dumps({**values, "machine": machine()}, indent=2) + "\n")
 
 
 def _show(values: dict[str, Any]) -> None:

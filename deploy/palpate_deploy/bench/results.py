@@ -87,9 +87,15 @@ def finish(
     else:
         show()
     if out is not None:
-        out.write_text(text + "\n", encoding="utf-8")
+        write_result(out, text + "\n")
     if save:
         append_history(name, values)
+
+
+def write_result(path: Path, text: str) -> None:
+    """Write a file of a result; its folder is made if there is none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
 
 
 def machine() -> dict[str, Any]:
@@ -112,8 +118,8 @@ def _cpu_model() -> str:
     return platform.processor() or platform.machine()
 
 
-def append_history(name: str, values: dict[str, Any]) -> Path:
-    """Append one line to ``tests/benchmarks/history.jsonl`` of the working tree.
+def history_folder() -> Path:
+    """Where ``history.jsonl`` is: ``tests/benchmarks`` of the working tree.
 
     Raises:
         ConfigError: The command does not run in palpate's working tree.
@@ -124,6 +130,16 @@ def append_history(name: str, values: dict[str, Any]) -> Path:
             f"--save: {folder.absolute()} does not exist",
             remedy="run it from the top of palpate's working tree, or leave out --save",
         )
+    return folder
+
+
+def append_history(name: str, values: dict[str, Any]) -> Path:
+    """Append one line to ``tests/benchmarks/history.jsonl`` of the working tree.
+
+    Raises:
+        ConfigError: The command does not run in palpate's working tree.
+    """
+    path = history_folder() / "history.jsonl"
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
     ).stdout.strip()
@@ -134,7 +150,6 @@ def append_history(name: str, values: dict[str, Any]) -> Path:
         "machine": machine(),
         **values,
     }
-    path = folder / "history.jsonl"
     with open(path, "a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
     return path

@@ -25,7 +25,7 @@ from palpate.bus import Delivery, Session, Subscriber
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS
 from palpate.errors import ConfigError, ErrorCode, RemoteError, StreamTimeout
 from palpate.files.atomic import written_whole
-from palpate.process import require, stop_on_signals
+from palpate.process import check_installed, require, stop_on_signals
 from palpate_deploy.bench.growth import (
     BINS,
     MEGABYTE,
@@ -324,15 +324,17 @@ def run_soak(
         raise ConfigError(
             f"{minutes:g} minutes are too short to see growth", remedy="give 2 minutes or more"
         )
+    if out is not None:
+        check_installed("matplotlib", extra="training")
     result, histories, disk = measure_soak(minutes, fingers, fem=fem)
     values = {
         "soak": asdict(result),
         "soak.goal_met": result.met,
         "soak.long_enough": result.decided,
     }
+    finish("soak", values, lambda: show(result), as_json=as_json, save=save, out=out)
     if out is not None:
         draw(histories, disk, result, out.with_suffix(".png"))
-    finish("soak", values, lambda: show(result), as_json=as_json, save=save, out=out)
     return 0 if result.met else FAILED
 
 

@@ -11,10 +11,43 @@ from palpate_deploy.cli.options import JsonOption, example, group
 
 bench_app = group("Latency and load, compared with a bare implementation (the floor).")
 
+
+# What cannot be written must be told before a measurement that takes hours.
+
+
+def _check_history(save: bool) -> bool:
+    if save:
+        from palpate_deploy.bench.results import history_folder
+
+        history_folder()
+    return save
+
+
+def _check_out(out: Path | None) -> Path | None:
+    from palpate.files.outputs import check_output
+
+    check_output(out, "--out", ".json")
+    return out
+
+
+def _check_page(page: Path | None) -> Path | None:
+    from palpate.files.outputs import check_output
+
+    check_output(page, "--page", ".md")
+    return page
+
+
 SaveOption = Annotated[
-    bool, typer.Option("--save", help="Append the result to tests/benchmarks/history.jsonl.")
+    bool,
+    typer.Option(
+        "--save",
+        help="Append the result to tests/benchmarks/history.jsonl.",
+        callback=_check_history,
+    ),
 ]
-OutOption = Annotated[Path | None, typer.Option(help="Write the result as JSON.")]
+OutOption = Annotated[
+    Path | None, typer.Option(help="Write the result as JSON.", callback=_check_out)
+]
 
 
 @bench_app.command(
@@ -76,7 +109,10 @@ def alignment(
     settle_seconds: Annotated[
         float, typer.Option(min=0, help="Time for the clocks to settle before it [s].")
     ] = 10.0,
-    page: Annotated[Path | None, typer.Option(help="Write the result as a page, Markdown.")] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option(help="Write the result as a page, Markdown.", callback=_check_page),
+    ] = None,
     json_: JsonOption = False,
     save: SaveOption = False,
 ) -> None:
@@ -179,7 +215,8 @@ def soak(
     fingers: Annotated[int, typer.Option(min=1, help="Virtual fingers.")] = 3,
     fem: Annotated[bool, typer.Option(help="With the simulation service.")] = False,
     out: Annotated[
-        Path | None, typer.Option(help="Write the result as JSON, and beside it a PNG.")
+        Path | None,
+        typer.Option(help="Write the result as JSON, and beside it a PNG.", callback=_check_out),
     ] = None,
     json_: JsonOption = False,
     save: SaveOption = False,

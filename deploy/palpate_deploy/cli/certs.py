@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,7 @@ import typer
 from palpate_deploy.cli.options import JsonOption, example, group
 
 if TYPE_CHECKING:
-    from palpate_deploy.station.certificates import IssuedCertificate
+    from palpate_deploy.station.certificates import DamagedCertificate, IssuedCertificate
 
 certs_app = group("Certificates of a lab, for stations that other hosts reach.")
 
@@ -70,6 +71,9 @@ def issue(
     target = make(folder, Role(role), name, host or (), days=days)
     made = read_certificate(TlsConfig.of_folder(target))
     print(f"{made.folder}: {role}, valid until {made.until:%Y-%m-%d}, for {', '.join(made.hosts)}")
+    if made.problem:
+        print(f"it does not hold: {made.problem}")
+        raise typer.Exit(1)
 
 
 @certs_app.command(epilog=example("palpate certs show lab-certs"))
@@ -82,34 +86,48 @@ def show(folder: FolderArgument, json_: JsonOption = False) -> None:
 
     found = list_certificates(folder)
     if json_:
-        rows = [
-            {
-                "folder": str(one.folder),
-                "role": one.role,
-                "name": one.name,
-                "hosts": one.hosts,
-                "until": one.until.isoformat(),
-                "problem": one.problem,
-            }
-            for one in found
-        ]
-        print(json.dumps(rows, indent=2))
+        print(json.dumps([_plain(one) for one in found], indent=2))
     else:
         _print_table(found)
     if any(one.problem for one in found):
         raise typer.Exit(1)
 
 
-def _print_table(found: list[IssuedCertificate]) -> None:
+def _plain(one: IssuedCertificate | DamagedCertificate) -> dict[str, object]:
+    from palpate_deploy.station.certificates import DamagedCertificate
+
+    row: dict[str, object] = {
+        "folder": str(one.folder),
+        "role": None,
+        "name": one.folder.name,
+        "hosts": (),
+        "until": None,
+        "problem": one.problem,
+    }
+    if not isinstance(one, DamagedCertificate):
+        row |= {
+            "role": one.role,
+            "name": one.name,
+            "hosts": one.hosts,
+            "until": one.until.isoformat(),
+        }
+    return row
+
+
+def _print_table(found: Sequence[IssuedCertificate | DamagedCertificate]) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from palpate_deploy.station.certificates import DamagedCertificate
     from palpate_deploy.station.logs import cell
 
     table = Table()
     for column in ("folder", "role", "name", "hosts", "until", ""):
         table.add_column(column, overflow="fold")
     for one in found:
+        if isinstance(one, DamagedCertificate):
+            table.add_row(cell(one.folder.name), "[red]none[/]", "", "", "", cell(one.problem))
+            continue
         table.add_row(
             cell(one.folder.name),
             one.role or "[red]none[/]",

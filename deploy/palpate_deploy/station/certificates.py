@@ -50,6 +50,10 @@ WARN_DAYS = 30
 _HERE = ("localhost", "127.0.0.1", "::1")  # processes of one host link to one another there
 _CLOCKS = datetime.timedelta(hours=1)  # another host's clock may be so far behind
 _REMEDY = "make one: palpate certs ca FOLDER"
+_OTHER_AUTHORITY = (
+    "issue as the owner of its files; put back a copy of one that is damaged, or make another "
+    "authority (palpate certs ca NEW-FOLDER) and issue all certificates again"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +91,14 @@ class IssuedCertificate:
         return (self.until - _now()) / datetime.timedelta(days=1)
 
 
+@dataclass(frozen=True, slots=True)
+class DamagedCertificate:
+    """A folder whose certificate cannot be read, and why."""
+
+    folder: Path
+    problem: str
+
+
 def make_authority(folder: Path, name: str = "lab", *, days: int = AUTHORITY_DAYS) -> None:
     """Make an authority in a new folder: ``ca.pem``, and ``ca.key`` that only its owner can read.
 
@@ -118,7 +130,8 @@ def issue(
         days: Validity [days]; it ends with the authority's at the latest.
 
     Raises:
-        ConfigError: No authority, it has ended, a name is wrong, or the folder exists.
+        ConfigError: No authority, it has ended or its key is another's, a name is wrong, or the
+            folder exists.
     """
     name = check_name(name or role.value, "name")
     if name in set(Role) and name != role.value:
@@ -195,18 +208,28 @@ def read_certificate(tls: TlsConfig, *, private: bool = True) -> IssuedCertifica
     )
 
 
-def list_certificates(folder: Path) -> list[IssuedCertificate]:
+def list_certificates(folder: Path) -> list[IssuedCertificate | DamagedCertificate]:
     """The certificates in the folders of an authority's folder; or the one in the folder itself.
 
     Raises:
-        ConfigError: There is none, or one cannot be read.
+        ConfigError: There is none.
     """
-    own = folder / _CERTIFICATE
-    paths = [own] if own.exists() else sorted(folder.glob(f"*/{_CERTIFICATE}"))
-    found = [read_certificate(TlsConfig.of_folder(path.parent)) for path in paths]
-    if not found and not (folder / AUTHORITY).exists():
+    # A folder that has lost one of its two files is a damaged certificate, not none.
+    files = (_CERTIFICATE, _KEY)
+    if any((folder / name).exists() for name in files):
+        folders = [folder]
+    else:
+        folders = sorted({path.parent for name in files for path in folder.glob(f"*/{name}")})
+    if not folders and not (folder / AUTHORITY).exists():
         raise ConfigError(f"{folder} holds no certificates", remedy=_REMEDY)
-    return found
+    return [_read_or_tell(one) for one in folders]
+
+
+def _read_or_tell(folder: Path) -> IssuedCertificate | DamagedCertificate:
+    try:
+        return read_certificate(TlsConfig.of_folder(folder))
+    except ConfigError as error:
+        return DamagedCertificate(folder, error.problem)
 
 
 def _problem(certificate: x509.Certificate, tls: TlsConfig) -> str:
@@ -266,10 +289,20 @@ def _usage(*, authority: bool) -> x509.KeyUsage:
 def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
     if not (folder / AUTHORITY).exists():
         raise ConfigError(f"{folder} holds no authority", remedy=_REMEDY)
-    key = _read_key(folder / AUTHORITY_KEY)
+    try:
+        key, authority = _read_key(folder / AUTHORITY_KEY), _read_pem(folder / AUTHORITY)
+    except ConfigError as error:  # whose remedy is to issue it again, as for any other
+        raise ConfigError(
+            f"the authority in {folder} cannot issue: {error.problem}", remedy=_OTHER_AUTHORITY
+        ) from error
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise ConfigError(f"{folder / AUTHORITY_KEY} is no key of palpate", remedy=_REMEDY)
-    return _read_pem(folder / AUTHORITY), key
+        raise ConfigError(f"{folder / AUTHORITY_KEY} is no key of palpate", remedy=_OTHER_AUTHORITY)
+    if _raw(key.public_key()) != _raw(authority.public_key()):
+        raise ConfigError(
+            f"{folder / AUTHORITY_KEY} is not the key of {folder / AUTHORITY}",
+            remedy=_OTHER_AUTHORITY,
+        )
+    return authority, key
 
 
 def _read_pem(path: Path) -> x509.Certificate:

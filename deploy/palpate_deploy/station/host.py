@@ -126,13 +126,19 @@ def running_folders() -> list[Path]:
         return []
 
 
-def _in_use(folder: Path) -> bool:
-    """Whether the process whose id ends the folder's name still runs."""
+def run_pid(folder: Path) -> int:
+    """Id at the end of a run folder's name, of who made it; 0 = it was made by something else."""
     pid = folder.name.rpartition("-")[2]
-    if not pid.isdigit():
+    return int(pid) if pid.isdigit() else 0
+
+
+def _in_use(folder: Path) -> bool:
+    """Whether the process that made a run's folder still runs."""
+    pid = run_pid(folder)
+    if not pid:
         return True  # made by something else
     try:
-        os.kill(int(pid), 0)
+        os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except PermissionError:

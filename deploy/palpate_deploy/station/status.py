@@ -12,9 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from palpate.bus import Session, endpoints
+from palpate.bus.presence import other_stations
 from palpate.census import PATIENCE_S, ROUTER, ProcessReport, take_census
 from palpate.config import LinkConfig
-from palpate.errors import PalpateError
+from palpate.errors import PalpateError, printable
 from palpate.messages import (
     SensorState,
     ServiceRequest,
@@ -135,9 +136,12 @@ def ask_status(session: Session, *, timeout_s: float = _ANSWER_S) -> list[Status
     return [answer for answer in answers if not isinstance(answer, PalpateError)]
 
 
-def nothing_runs(station: str) -> str:
-    """What a station is told of which no process answers."""
-    return f"no process of station {station!r} runs: start it with `palpate up`"
+def nothing_runs(session: Session) -> str:
+    """What is told of a session's station if no process of it answers."""
+    told = f"no process of station {session.station!r} runs: start it with `palpate up`"
+    if others := other_stations(session.alive(station="*"), session.station):
+        told += f", or name another one that this router sees: --station {' | '.join(others)}"
+    return told
 
 
 def show_status(
@@ -166,14 +170,17 @@ def show_status(
         expected = frozenset() if said is None else said.processes
         census = take_census(session, expected=expected, timeout_s=timeout_s)
         router = session.has_router()
+        nothing = "" if census else nothing_runs(session)
     source = "" if said is None else said.source
     if not source and any(one.status is not None and one.status.processes for one in census):
         source = "the supervisor of the station"
-    found = troubles(census)
+    found = troubles(census, said)
     if as_json:
         print(json.dumps(_as_json(station, router, source, census, found), indent=2))
     else:
         _print(Console(), station, source, census, found)
+        if nothing:
+            print(printable(nothing))
     return FAILED if found or not census else 0
 
 
@@ -246,8 +253,6 @@ def _table(station: str, census: Iterable[ProcessReport]) -> Table:
             cell(status.message),
             shown_counters(status),
         )
-    if not table.row_count:
-        table.caption = nothing_runs(station)
     return table
 
 

@@ -21,6 +21,7 @@ from rich.text import Text
 
 from palpate.census import ROUTER
 from palpate.config import LinkConfig
+from palpate.errors import printable
 from palpate_deploy.station.activity import (
     DropCount,
     ProcessActivity,
@@ -33,6 +34,7 @@ from palpate_deploy.station.logs import FAILED, cell
 from palpate_deploy.station.observation import RATES_S, ObservedProcess, StationObserver
 from palpate_deploy.station.status import duration_text, nothing_runs
 from palpate_deploy.station.troubles import (
+    Expectation,
     Trouble,
     ask_through_router,
     expectation,
@@ -87,17 +89,18 @@ def run_top(
             time.sleep(RATES_S)
             observed = observer.look()
             if as_json:
-                print(json.dumps(_as_json(station, observed), indent=2))
+                print(json.dumps(_as_json(station, observed, said), indent=2))
             else:
-                console.print(screen(station, observed, console.width))
-            found = troubles(one.report for one in observed)
+                console.print(screen(station, observed, console.width, said))
+            found = troubles((one.report for one in observed), said)
             nobody = all((one.report.service, one.report.instance) == ROUTER for one in observed)
             if nobody and not as_json:
-                console.print(nothing_runs(station), markup=False)
+                print(printable(nothing_runs(session)))
             return FAILED if found or nobody else 0
         with _keys() as key, Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
-                live.update(screen(station, observer.look(), console.width), refresh=True)
+                shown = screen(station, observer.look(), console.width, said)
+                live.update(shown, refresh=True)
                 if key(period_s) in _QUIT:
                     break
     return 0
@@ -126,10 +129,15 @@ def _keys() -> Iterator[Callable[[float], str | None]]:
         termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
 
 
-def screen(station: str, observed: Sequence[ObservedProcess], width: int) -> Group:
-    """Everything of a station as one picture of ``width`` characters."""
+def screen(
+    station: str,
+    observed: Sequence[ObservedProcess],
+    width: int,
+    said: Expectation | None = None,
+) -> Group:
+    """A station as one picture of ``width`` characters; ``said`` is for ``troubles``."""
     processes, sensors = process_activities(observed), sensor_activities(observed)
-    found = troubles(one.report for one in observed)
+    found = troubles((one.report for one in observed), said)
     well = sum(one.state in ("ready", "routes", "finished") for one in processes)
     title = Text(f"station {station}   {well} of {len(processes)} processes well   ")
     title.append(time.strftime("%H:%M:%S"), style="dim")
@@ -260,10 +268,12 @@ def _ms(seconds: float | None) -> str:
     return "-" if seconds is None else f"{1e3 * seconds:.1f}"
 
 
-def _as_json(station: str, observed: Sequence[ObservedProcess]) -> dict[str, Any]:
+def _as_json(
+    station: str, observed: Sequence[ObservedProcess], said: Expectation | None = None
+) -> dict[str, Any]:
     return {
         "station": station,
         "processes": [asdict(one) for one in process_activities(observed)],
         "sensors": [asdict(one) for one in sensor_activities(observed)],
-        "troubles": [asdict(one) for one in troubles(one.report for one in observed)],
+        "troubles": [asdict(one) for one in troubles((one.report for one in observed), said)],
     }

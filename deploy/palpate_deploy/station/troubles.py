@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from palpate.bus import Session
-from palpate.bus.no_router import RouterRefuses
+from palpate.bus.no_router import RouterAbsent, RouterRefuses
 from palpate.census import ROUTER, SUPERVISOR, ProcessName, ProcessReport
 from palpate.config import LinkConfig, endpoint_host_port, is_loopback
 from palpate.errors import LinkError
 from palpate.messages import ServiceState, SupervisedProcess
-from palpate_deploy.station.host import running_folders
+from palpate_deploy.station.host import run_pid, running_folders
 from palpate_deploy.station.profile import load_profile
 
 RUNNING = "running"
@@ -23,10 +23,17 @@ RUNNING = "running"
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """The processes that should run, and in one line who says so."""
+    """What should run.
+
+    Attributes:
+        source: In one line, who says so.
+        processes: The processes that should run.
+        pid: Process id of the ``palpate up`` that runs them on this host; 0 = none is known.
+    """
 
     source: str
     processes: frozenset[ProcessName]
+    pid: int = 0
 
 
 def expectation_of(profile: str) -> Expectation:
@@ -62,7 +69,7 @@ def expectation_here(connect: Iterable[str], station: str) -> Expectation | None
             (name, f"{name}-{replica}" if replica and name != ROUTER[0] else name)
             for name in services
         }
-        return Expectation(f"run {folder.name} on this host", frozenset(names))
+        return Expectation(f"run {folder.name} on this host", frozenset(names), run_pid(folder))
     return None
 
 
@@ -81,7 +88,7 @@ def expectation(link: LinkConfig, station: str, profile: str | None) -> Expectat
     if here is None:
         return said
     supervisors = {name for name in here.processes if name[0] == SUPERVISOR[0]}
-    return replace(said, processes=said.processes | supervisors)
+    return replace(said, processes=said.processes | supervisors, pid=here.pid)
 
 
 def ask_through_router(link: LinkConfig, station: str, said: Expectation | None) -> Session:
@@ -92,14 +99,26 @@ def ask_through_router(link: LinkConfig, station: str, said: Expectation | None)
     """
     try:
         return Session.open(link.model_copy(update={"direct": False}), station=station)
+    except RouterRefuses:
+        raise
     except LinkError as error:
-        refused = isinstance(error, RouterRefuses)
-        if refused or said is None or ROUTER not in said.processes:
+        if said is None or ROUTER not in said.processes:
             raise
-        raise LinkError(
-            f"the router at {', '.join(link.connect)} does not answer, but should: {said.source}",
-            remedy="it starts, or hangs and is started again by itself: ask again in ten seconds",
-        ) from error
+        where = ", ".join(link.connect)
+        if said.pid:
+            raise LinkError(
+                f"the router at {where} does not answer, but should: {said.source}",
+                remedy="it starts, or hangs and is started again by itself: ask again in ten "
+                "seconds",
+            ) from error
+        if isinstance(error, RouterAbsent):
+            raise RouterAbsent(
+                f"no router at {where}: the station of {said.source} does not run, or cannot be "
+                "reached from here",
+                remedy="start it with `palpate up` of this profile, or with `systemctl start` "
+                "where it is installed",
+            ) from error
+        raise
 
 
 def _profile(folder: Path) -> dict[str, Any]:
@@ -110,13 +129,14 @@ def _profile(folder: Path) -> dict[str, Any]:
         return {}
 
 
-def _place(endpoint: str) -> tuple[str, int]:
-    """Host and port; every name of the own host is the same place."""
+def _place(endpoint: str) -> tuple[str, str, int]:
+    """Protocol, host and port; every name of the own host is the same place."""
     try:
         host, port = endpoint_host_port(endpoint)
     except ValueError:
-        return endpoint, 0
-    return ("loopback" if is_loopback(host) or host in ("0.0.0.0", "::") else host), port
+        return endpoint, "", 0
+    here = is_loopback(host) or host in ("0.0.0.0", "::")
+    return endpoint.partition("/")[0], "loopback" if here else host, port
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +149,11 @@ class Trouble:
     remedy: str
 
 
-def troubles(census: Iterable[ProcessReport]) -> list[Trouble]:
-    """Everything that is wrong at a station; empty = all that should run is ready, or finished."""
+def troubles(census: Iterable[ProcessReport], said: Expectation | None = None) -> list[Trouble]:
+    """Everything that is wrong at a station; empty = all that should run is ready, or finished.
+
+    ``said`` may know a supervisor on this host that cannot be reached, and nobody else reports.
+    """
     reports = list(census)
     supervised = {
         (one.service, one.instance): one
@@ -141,7 +164,8 @@ def troubles(census: Iterable[ProcessReport]) -> list[Trouble]:
     found = []
     for report in reports:
         name = report.service, report.instance
-        if (wrong := _wrong(report, supervised.get(name))) is not None:
+        wrong = _wrong(report, supervised.get(name), 0 if said is None else said.pid)
+        if wrong is not None:
             found.append(Trouble(*name, *wrong))
     return found
 
@@ -151,12 +175,20 @@ def process_name(service: str, instance: str) -> str:
     return service if instance == service else f"{service}/{instance}"
 
 
-def _wrong(report: ProcessReport, supervised: SupervisedProcess | None) -> tuple[str, str] | None:
+def _wrong(
+    report: ProcessReport, supervised: SupervisedProcess | None, supervisor_pid: int
+) -> tuple[str, str] | None:
     """Problem and remedy of one process; None = there is none."""
     status = report.status
     if (report.service, report.instance) == ROUTER and status is None:
         return None if report.alive else ("is not connected", "look at its log; ask again")
     if status is None and not report.alive:
+        if report.service == SUPERVISOR[0] and supervisor_pid:
+            return (
+                f"runs as process {supervisor_pid} and cannot be reached",
+                f"one that is stopped goes on after `kill -CONT {supervisor_pid}`; end one that "
+                "hangs, and start it again with `palpate up`",
+            )
         if supervised is None:
             return "does not run", "start it with `palpate up`, or take it out of the profile"
         if supervised.state == "exited":  # a finite source at its end: others are started again

@@ -387,7 +387,14 @@ class Session(Closing):
         """The replies; with ``silence`` their absence is an error among them."""
         settle_s = _YOUNG_S if self._young() else 0.0
         asking = self._asking()
-        nobody = partial(no_reply, asking, key, roles=self._link.has_roles, device=endpoint.device)
+        nobody = partial(
+            no_reply,
+            asking,
+            key,
+            roles=self._link.has_roles,
+            device=endpoint.device,
+            station=self.station,
+        )
         return ask(
             asking,
             key,

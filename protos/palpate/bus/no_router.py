@@ -14,6 +14,10 @@ class RouterRefuses(LinkError):
     """A router listens there, and one of the two certificates is not accepted."""
 
 
+class RouterAbsent(LinkError):
+    """Nothing listens where a router is looked for."""
+
+
 _PROBE_S = 1.0
 """How long is looked for what listens where no link came about [s]."""
 
@@ -23,7 +27,7 @@ def no_router(link: LinkConfig) -> LinkError:
     for endpoint in link.connect:
         if (found := _why_no_link(link, endpoint)) is not None:
             return found
-    return LinkError(
+    return RouterAbsent(
         f"no router at {', '.join(link.connect)}",
         remedy="start one with `palpate up`, or name yours with --connect",
     )

@@ -74,6 +74,16 @@ def alive(
     return [AliveService(*name, ready) for name, ready in sorted(found.items())]
 
 
+_STATIONS_MOST = 16
+"""So many other stations are told of; names come from other processes, and may be invented."""
+
+
+def other_stations(found: Iterable[AliveService], station: str) -> list[str]:
+    """The stations of the processes that were ``found``; none if some are of ``station``."""
+    names = {one.station for one in found}
+    return [] if station in names else sorted(names)[:_STATIONS_MOST]
+
+
 class CallerToken(Closing):
     """A caller's token: while it exists, the caller waits for an answer."""
 

@@ -19,6 +19,7 @@ import zenoh
 
 from palpate.bus.attachments import OnTimings, attachment_of, timings_of
 from palpate.bus.endpoints import Endpoint
+from palpate.bus.presence import alive, other_stations
 from palpate.bus.topics import ENCODING_PREFIX, MAX_MESSAGE_BYTES, check_schema, check_size
 from palpate.bus.zenoh_session import while_open
 from palpate.codec import ERROR
@@ -280,13 +281,20 @@ def raise_errors(replies: Iterator[R | PalpateError]) -> Iterator[R]:
 
 
 def no_reply(
-    session: zenoh.Session, key: str, known: bool, *, roles: bool = False, device: str = ""
+    session: zenoh.Session,
+    key: str,
+    known: bool,
+    *,
+    roles: bool = False,
+    device: str = "",
+    station: str,
 ) -> LinkError:
     """The error for a question that had no reply at all: nobody serves it, or the reply was lost.
 
     Zenoh tells neither. If nobody was ``known`` to serve the key when it was asked, that is looked
     up once more here. With ``roles`` the question may also have been refused on its way, of which
     Zenoh does not tell either. ``device`` is what the question is put to, if only gateways answer.
+    ``station`` is the one of the key.
     """
     served = known or is_served(session, key, LOOK_S)
     if roles and served:
@@ -300,6 +308,14 @@ def no_reply(
             f"{key} is served, but no answer arrived: it ended while it worked on the question, "
             f"or its answer is {_DROPPED}",
             remedy="ask again; if that fails, ask for less and look at the log of the service",
+        )
+    with while_open():
+        others = other_stations(alive([session], "*", timeout_s=LOOK_S), station)
+    if others:
+        return LinkError(
+            f"no process of station {station!r} runs: nobody answers on {key}",
+            remedy="start it with `palpate up`, or name another one that this router sees, "
+            f"--station or station=: {', '.join(others)}",
         )
     if device:
         return LinkError(
