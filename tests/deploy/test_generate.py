@@ -43,6 +43,7 @@ from palpate_training.datasets.features import joined
 from palpate_training.experiment.generate.fingertips import share_out
 from palpate_training.experiment.generate.pipeline import (
     EXPERIMENT,
+    IDLE,
     MIXED,
     STORE,
     TRIALS,
@@ -383,6 +384,24 @@ def test_fingertips_have_skins_presses_and_specimens_of_their_own(tmp_path: Path
     again = runner.invoke(twin_app, words)
     assert [one["finished"] for one in json.loads(again.stdout)] == ["before", "before"]
     assert (other / MIXED).stat().st_mtime_ns == stamp
+    # What is damaged is named, and what is missing is made.
+    words.remove("--json")
+    for name in (MIXED, IDLE):
+        (other / name).write_bytes((other / name).read_bytes()[:1000])
+    damaged = runner.invoke(twin_app, words).exception
+    assert isinstance(damaged, DatasetError)
+    assert str(other / MIXED) in str(damaged)
+    assert "remove it" in damaged.remedy
+    (other / MIXED).unlink()
+    again = runner.invoke(twin_app, words)
+    assert f"{one}: was finished before" in again.output
+    assert len(read_mixed(other / MIXED)) == len(parts[1])
+    with np.load(other / IDLE) as idle:
+        assert {"unit-003", "unit-004"} <= set(idle.files)
+    # Nor does an experiment on one fingertip go beside them.
+    refused = runner.invoke(twin_app, ["generate", str(out), "--random", "3"])
+    assert "on several fingertips" in str(refused.exception)
+    assert not (out / SPEC_FILE).exists()
 
 
 def test_indenters_that_no_specimen_was_pressed_with_are_left_out(tmp_path: Path) -> None:
@@ -474,6 +493,21 @@ def test_another_experiment_does_not_go_into_the_same_folder(
         generate(generated.folder, replace(SPEC, seed=3), specimens(), FemSimulator(), workers=1)
     with pytest.raises(ConfigError, match="members"):
         generate(generated.folder, SPEC, specimens()[:1], FemSimulator(), workers=1)
+    words = ["generate", str(generated.folder), "--random", "2", "--fingertips", "2"]
+    refused = CliRunner().invoke(twin_app, words)
+    assert "on one fingertip" in str(refused.exception)
+    assert not list(generated.folder.glob("fingertip-*"))
+
+
+@pytest.mark.parametrize("extra", [(), ("--fingertips", "2")])
+def test_an_experiment_without_a_fingertip_leaves_the_folder_to_another(
+    tmp_path: Path, extra: tuple[str, ...]
+) -> None:
+    words = ["generate", str(tmp_path), "--random", "2", "--edge-mm", "50", *extra]
+    refused = CliRunner().invoke(twin_app, words)
+    assert "edge_m" in str(refused.exception)
+    assert not list(tmp_path.rglob(SPEC_FILE))
+    keep_spec(tmp_path, SPEC, specimens())
 
 
 def test_damaged_files_are_named(generated: GeneratedExperiment) -> None:
