@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
+from palpate.files.hdf5 import rows_sha256
 from palpate_fem.cli.app import fem_app
 from palpate_fem.config import FingertipParameters
 from palpate_fem.electrodes.gap import Gap
@@ -27,10 +28,18 @@ from palpate_fem.population.members import read_population
 from palpate_fem.population.press_library import PressLibrary
 from palpate_fem.population.responses import Population
 from palpate_fem.population.sensor_fit import fit_sensor
-from palpate_fem.population.touches import FEATURES, SensorTouches, held, read_touches, touches_of
+from palpate_fem.population.touches import (
+    DIGESTED,
+    FEATURES,
+    SensorTouches,
+    held,
+    read_touches,
+    touches_of,
+)
 from palpate_fem.service.biotac import BiotacTip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter
+from palpate_training.datasets.features import FEATURE_COLUMNS
 
 Floats = NDArray[np.float64]
 
@@ -280,9 +289,21 @@ def test_a_recording_is_read_or_refused(tmp_path: Path) -> None:
     for name in ("electrodes", "baseline", "force", "sensor"):
         without = write_recording(tmp_path / f"{name}.h5", leave_out=name)
         cases.append((lambda path=without: read_touches(path), f"'{name}' is missing"))  # type: ignore[misc]
+    changed = write_recording(tmp_path / "changed.h5")
+    with h5py.File(changed, "r+") as file:
+        arrays = {name: file[name][()] for name in DIGESTED if name in file}
+        file.attrs["content_sha256"] = rows_sha256(["mine"], arrays)
+    assert len(read_touches(changed)) == 2
+    with h5py.File(changed, "r+") as file:
+        file["force"][0] *= -1.0
+    cases.append((lambda: read_touches(changed), "does not match its content_sha256"))
     for call, words in cases:
         with pytest.raises(DatasetError, match=words):
             call()
+
+
+def test_the_digest_is_of_all_columns_of_a_data_set() -> None:
+    assert tuple(FEATURE_COLUMNS) == DIGESTED
 
 
 def test_the_command_writes_a_population_that_the_twin_takes(tmp_path: Path) -> None:
