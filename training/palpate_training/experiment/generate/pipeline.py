@@ -320,7 +320,7 @@ def is_finished(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen
                 pass
         except DatasetError as error:
             raise DatasetError(
-                error.problem,
+                f"a data set is damaged: {error.problem}",
                 remedy="remove it and run this again: it is made again from the trials",
             ) from error
     return len(there) == 2
