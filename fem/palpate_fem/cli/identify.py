@@ -420,8 +420,8 @@ def fit_sensor_command(
         ]
     if fit.tells_nothing:
         lines.append(
-            "no press explains these electrodes: check that they are E1..E19 in order, raw and "
-            "live, or simulate more presses"
+            "these presses do not explain the electrodes: simulate more; if that does not help, "
+            "check that they are E1..E19 in order, raw and live"
         )
     print_lines(*lines, f"wrote {out}")
 
