@@ -237,7 +237,7 @@ def catalogue() -> tuple[Fault, ...]:
               "stream", RESTARTED_S, "stale", 0.1, main_killed, own=True),
         Fault("cable pulled for 5 s", "network", _cable, 5.0, "stream", 2.0, "stale", 0.1),
         Fault("disk full", "disk", _fill, 6.0, "state recorder", 3.0, "state recorder", 1.0,
-              r"recorder.*(full|bytes are free|No space)", own=True),
+              r"recorder.*(full|MB are free|No space)", own=True),
         Fault("disk refuses to write", "disk", _limit_files, 6.0, "state recorder", 3.0,
               "state recorder", 1.0, r"File too large|refuse", own=True),
         Fault("disk read-only when the recorder starts", "disk", _read_only, 6.0,

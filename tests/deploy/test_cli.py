@@ -30,6 +30,7 @@ from palpate.errors import (
     RecordingError,
     StreamTimeout,
 )
+from palpate_deploy.cli import WIDE
 from palpate_deploy.cli import data as training
 from palpate_deploy.cli.app import app
 from palpate_deploy.diagnose import doctor
@@ -384,3 +385,15 @@ def test_a_negative_wait_is_refused(command: list[str]) -> None:
     result = CliRunner().invoke(app, [*command, "--timeout-s", "-1"])
     assert result.exit_code == 2
     assert "--timeout-s" in result.output
+
+
+@pytest.mark.parametrize("columns", ["", "90"])
+def test_tables_in_a_file_are_not_cut(
+    palpate: Palpate, monkeypatch: pytest.MonkeyPatch, columns: str
+) -> None:
+    monkeypatch.delenv("COLUMNS")
+    if columns:
+        monkeypatch.setenv("COLUMNS", columns)
+    width = "from rich.console import Console; atexit.register(lambda: print(Console().width))"
+    done = palpate("--version", first=f"import atexit; {width}")
+    assert done.stdout.splitlines()[-1] == (columns or WIDE)

@@ -14,7 +14,7 @@ import pytest
 
 from palpate.bus.topics import SCHEMAS
 from palpate.config import LinkConfig
-from palpate.errors import RecordingError
+from palpate.errors import LinkError, RecordingError
 from palpate.files.record import read_record
 from palpate.files.record_writer import RecordWriter
 from palpate.health import Health
@@ -225,3 +225,21 @@ def test_record_says_that_messages_are_lost(
     monkeypatch.setattr(records, "stop_on_signals", threading.Event)
     with pytest.raises(RecordingError, match=rf"2,478 messages .* not in it \({counter}\)"):
         records.record_station(link, "lab", {"out": tmp_path}, duration_s=1.0)
+
+
+def test_record_names_what_is_cut_off(
+    link: LinkConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    part = tmp_path / "lab-20261130T081327.448Z.mcap.part"
+
+    def fail(*_: object, **__: object) -> None:
+        part.write_bytes(bytes(2048))
+
+    monkeypatch.setattr(service, "run_recorder", fail)
+    monkeypatch.setattr(records, "stop_on_signals", threading.Event)
+    with pytest.raises(LinkError, match="nothing came"):
+        records.record_station(link, "lab", {"out": tmp_path}, duration_s=1.0)
+    assert f"palpate recover {part}" in capsys.readouterr().out

@@ -43,6 +43,7 @@ from palpate_training.datasets.features import joined
 from palpate_training.experiment.generate.fingertips import share_out
 from palpate_training.experiment.generate.pipeline import (
     EXPERIMENT,
+    IDLE,
     MIXED,
     STORE,
     TRIALS,
@@ -395,6 +396,20 @@ def test_fingertips_have_skins_presses_and_specimens_of_their_own(tmp_path: Path
     again = runner.invoke(twin_app, words)
     assert [one["finished"] for one in json.loads(again.stdout)] == ["before", "before"]
     assert (other / MIXED).stat().st_mtime_ns == stamp
+    words.remove("--json")
+    again = runner.invoke(twin_app, words)
+    assert f"{other}: was finished before" in again.output
+    # What is damaged is named.
+    whole = (other / MIXED).read_bytes()
+    (other / MIXED).write_bytes(whole[:1000])
+    damaged = runner.invoke(twin_app, words).exception
+    assert isinstance(damaged, DatasetError)
+    assert str(other / MIXED) in damaged.problem
+    assert "remove it" in damaged.remedy
+    # Nor does an experiment on one fingertip go beside them.
+    refused = runner.invoke(twin_app, ["generate", str(out), "--random", "3"])
+    assert "on several fingertips" in str(refused.exception)
+    assert not (out / SPEC_FILE).exists()
 
 
 def test_indenters_that_no_specimen_was_pressed_with_are_left_out(tmp_path: Path) -> None:
@@ -486,6 +501,21 @@ def test_another_experiment_does_not_go_into_the_same_folder(
         generate(generated.folder, replace(SPEC, seed=3), specimens(), FemSimulator(), workers=1)
     with pytest.raises(ConfigError, match="members"):
         generate(generated.folder, SPEC, specimens()[:1], FemSimulator(), workers=1)
+    words = ["generate", str(generated.folder), "--random", "2", "--fingertips", "2"]
+    refused = CliRunner().invoke(twin_app, words)
+    assert "on one fingertip" in str(refused.exception)
+    assert not list(generated.folder.glob("fingertip-*"))
+
+
+@pytest.mark.parametrize("extra", [(), ("--fingertips", "2")])
+def test_an_experiment_without_a_fingertip_leaves_the_folder_to_another(
+    tmp_path: Path, extra: tuple[str, ...]
+) -> None:
+    words = ["generate", str(tmp_path), "--random", "2", "--edge-mm", "50", *extra]
+    refused = CliRunner().invoke(twin_app, words)
+    assert "edge_m" in str(refused.exception)
+    assert not list(tmp_path.rglob(SPEC_FILE))
+    keep_spec(tmp_path, SPEC, specimens())
 
 
 def test_damaged_files_are_named(generated: GeneratedExperiment) -> None:
@@ -497,6 +527,15 @@ def test_damaged_files_are_named(generated: GeneratedExperiment) -> None:
             run(generated.folder)
     finally:
         trial.write_bytes(whole)
+
+
+def test_idle_counts_that_are_damaged_are_made_again(generated: GeneratedExperiment) -> None:
+    path = generated.folder / IDLE
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    run(generated.folder)
+    with np.load(path) as idle:
+        assert {"biotac-1", "biotac-2"} <= set(idle.files)
 
 
 def test_a_damaged_spec_is_named(tmp_path: Path) -> None:

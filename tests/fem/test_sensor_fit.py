@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
+from palpate.files.hdf5 import rows_sha256
 from palpate_fem.cli.app import fem_app
 from palpate_fem.config import FingertipParameters
 from palpate_fem.electrodes.gap import Gap
@@ -22,15 +23,23 @@ from palpate_fem.electrodes.specimen import SENSING, SpecimenParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.population.explain import TouchExplainer, TouchPrior
+from palpate_fem.population.explain import ANGLE_SD_RAD, TouchExplainer, TouchPrior
 from palpate_fem.population.members import read_population
 from palpate_fem.population.press_library import PressLibrary
 from palpate_fem.population.responses import Population
 from palpate_fem.population.sensor_fit import fit_sensor
-from palpate_fem.population.touches import FEATURES, SensorTouches, held, read_touches, touches_of
+from palpate_fem.population.touches import (
+    DIGESTED,
+    FEATURES,
+    SensorTouches,
+    held,
+    read_touches,
+    touches_of,
+)
 from palpate_fem.service.biotac import BiotacTip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter
+from palpate_training.datasets.features import FEATURE_COLUMNS
 
 Floats = NDArray[np.float64]
 
@@ -176,6 +185,21 @@ def test_a_touch_beyond_all_presses_is_refused(bench: Bench) -> None:
         TouchExplainer(bench.model, bench.library).learn(bench.touches.some(slice(0, 0)))
 
 
+def test_forces_of_the_wrong_sign_are_refused(bench: Bench) -> None:
+    pushed = replace(bench.touches, force=-bench.touches.force)
+    with pytest.raises(DatasetError, match="degrees away from those of the nearest"):
+        fit_sensor(bench.model, bench.library, pushed)
+
+
+def test_electrodes_that_no_press_explains_are_told(bench: Bench) -> None:
+    other = np.clip(bench.touches.rest - 3.0 * bench.touches.tared[:, ::-1], 1.0, 4094.0)
+    mixed = replace(bench.touches, counts=other)
+    for touches, nothing in ((bench.touches, False), (mixed, True)):
+        fit = fit_sensor(bench.model, bench.library, touches, rounds=2)
+        assert fit.tells_nothing is nothing
+        assert fit.angle_rad < ANGLE_SD_RAD
+
+
 def test_candidates_have_the_measured_size_of_force(bench: Bench) -> None:
     found = bench.library.candidates(bench.later.force)
     there = np.isfinite(found.angle_rad)
@@ -265,9 +289,21 @@ def test_a_recording_is_read_or_refused(tmp_path: Path) -> None:
     for name in ("electrodes", "baseline", "force", "sensor"):
         without = write_recording(tmp_path / f"{name}.h5", leave_out=name)
         cases.append((lambda path=without: read_touches(path), f"'{name}' is missing"))  # type: ignore[misc]
+    changed = write_recording(tmp_path / "changed.h5")
+    with h5py.File(changed, "r+") as file:
+        arrays = {name: file[name][()] for name in DIGESTED if name in file}
+        file.attrs["content_sha256"] = rows_sha256(["mine"], arrays)
+    assert len(read_touches(changed)) == 2
+    with h5py.File(changed, "r+") as file:
+        file["force"][0] *= -1.0
+    cases.append((lambda: read_touches(changed), "does not match its content_sha256"))
     for call, words in cases:
         with pytest.raises(DatasetError, match=words):
             call()
+
+
+def test_the_digest_is_of_all_columns_of_a_data_set() -> None:
+    assert tuple(FEATURE_COLUMNS) == DIGESTED
 
 
 def test_the_command_writes_a_population_that_the_twin_takes(tmp_path: Path) -> None:
@@ -297,6 +333,7 @@ def test_the_command_writes_a_population_that_the_twin_takes(tmp_path: Path) -> 
     done = CliRunner().invoke(fem_app, [*command, "--touches", "2"], env={"COLUMNS": "100"})
     assert done.exit_code == 0, done.output
     assert "fitted to the rest and 2 of 3 touches" in done.output
+    assert "degrees off the nearest presses" in done.output
     (member,) = read_population(out)
     assert member.specimen.name == "mine"
     assert member.found["touches"] == 2

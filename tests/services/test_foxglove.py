@@ -180,3 +180,11 @@ def test_a_damaged_record_leaves_no_file(record: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.mcap", "lab.mcap"]
     with pytest.raises(ConfigError, match="record itself"):
         export_foxglove(record, tmp_path / "." / "lab.mcap")
+
+
+def test_a_file_for_foxglove_is_no_damaged_record(record: Path, tmp_path: Path) -> None:
+    export_foxglove(record, tmp_path / "f.mcap")
+    with pytest.raises(RecordingError, match="schema 'foxglove") as caught:
+        list(read_record(tmp_path / "f.mcap"))
+    assert caught.value.problem.count("f.mcap") == 1
+    assert "open it in Foxglove" in caught.value.remedy

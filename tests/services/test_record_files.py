@@ -206,7 +206,7 @@ def test_too_little_space_is_reported_and_recording_resumes(
         assert status.last_error is not None
         assert status.last_error.code is ErrorCode.DISK
         assert str(tmp_path / "runs") in status.last_error.message
-        assert "bytes free" in status.last_error.message
+        assert "less than 100 MB are free (10 MB free)" in status.last_error.message
         files.write(sample(2))
         files.tick()
         assert health.counters["lost_disk_full"] == 1
@@ -300,7 +300,7 @@ def test_each_full_disk_is_told_once_whatever_else_is_wrong(
             assert health.counters["disk_failures"] == full
             free[0] = 10**9
             files.tick()
-    told = [record for record in caplog.records if "bytes are free" in record.getMessage()]
+    told = [record for record in caplog.records if "MB are free" in record.getMessage()]
     assert len(told) == 2
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from tests.training.invented_population import SMALL, population
 from typer.testing import CliRunner
 
-from palpate.errors import DatasetError
+from palpate.errors import ConfigError, DatasetError
 from palpate_training.cli import train_app
 from palpate_training.datasets.features import FeatureDataset, write_dataset
 from palpate_training.learning import population_fit
@@ -49,11 +49,17 @@ def rows(data: FeatureDataset) -> PopulationRows:
 
 
 @pytest.fixture(scope="module")
-def folder(data: FeatureDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stored(data: FeatureDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("population") / "features.h5"
+    write_dataset(path, data)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(stored: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("trained")
-    write_dataset(out / "features.h5", data)
     config = replace(SMALL, epochs=40, batch_rows=512)
-    train_population(out / "features.h5", out, config=config, device="cpu")
+    train_population(stored, out, config=config, device="cpu")
     return out
 
 
@@ -84,10 +90,12 @@ def test_bounds_hold_on_specimens_that_neither_network_nor_bound_has_met(
     )
 
 
-def test_a_network_is_measured_again_without_a_training(folder: Path, tmp_path: Path) -> None:
+def test_a_network_is_measured_again_without_a_training(
+    folder: Path, stored: Path, tmp_path: Path
+) -> None:
     shutil.copytree(folder, tmp_path / "again")
     weights = (folder / WEIGHTS).read_bytes()
-    arguments = ["population", str(folder / "features.h5"), str(tmp_path / "again"), "--measure"]
+    arguments = ["population", str(stored), str(tmp_path / "again"), "--measure"]
     result = CliRunner().invoke(train_app, arguments, env={"COLUMNS": "200"})
     assert result.exit_code == 0, result.output
     assert "bound of force_magnitude holds" in result.output
@@ -97,6 +105,38 @@ def test_a_network_is_measured_again_without_a_training(folder: Path, tmp_path: 
     assert after == before
     (tmp_path / "again" / WEIGHTS).unlink()
     assert isinstance(CliRunner().invoke(train_app, arguments).exception, DatasetError)
+
+
+def test_a_network_is_measured_with_the_seed_and_on_the_data_of_its_training(
+    stored: Path, tmp_path: Path
+) -> None:
+    """Else presses that it has learned from would count as unseen."""
+    out = tmp_path / "trained"
+    small = replace(SMALL, epochs=1, width=16)
+    _, facts = train_population(stored, out, config=small, device="cpu", seed=2)
+    for seed in (None, 2):
+        _, again = train_population(stored, out, config=small, seed=seed, measure=True)
+        assert again["seed"] == 2
+        assert again["unseen_specimens"] == facts["unseen_specimens"]
+    report = (out / REPORT).read_text()
+    with pytest.raises(ConfigError, match=r"--seed 1 is not that of .*, 2"):
+        train_population(stored, out, config=small, seed=1, measure=True)
+    write_dataset(tmp_path / "other.h5", population(specimens=24, presses=60, each=12))
+    with pytest.raises(DatasetError, match=r"other\.h5 is not the data set of .*learned"):
+        train_population(tmp_path / "other.h5", out, config=small, measure=True)
+    assert (out / REPORT).read_text() == report
+    (out / REPORT).unlink()  # a training that was ended before its report
+    with pytest.raises(DatasetError, match="does not say what the network was trained with"):
+        train_population(stored, out, config=small, measure=True)
+    _, again = train_population(stored, out, config=small, seed=2, measure=True)
+    assert again["unseen_specimens"] == facts["unseen_specimens"]
+
+
+def test_a_network_is_not_replaced(folder: Path, stored: Path) -> None:
+    weights = (folder / WEIGHTS).read_bytes()
+    with pytest.raises(DatasetError, match="holds a network that is trained"):
+        train_population(stored, folder, config=replace(SMALL, epochs=1), device="cpu")
+    assert (folder / WEIGHTS).read_bytes() == weights
 
 
 def test_a_trained_folder_tells_a_finger_and_a_damaged_one_is_named(

@@ -284,6 +284,8 @@ def data_generate(
             found[share.name] = before if summary is None else summary
             if summary is not None and not as_json:
                 _show_generated(summary)
+            elif not as_json:
+                typer.echo(f"{out / share.name}: was finished before")
     if len(found) < len(shares):
         typer.echo(f"stopped; {out} keeps what is done: run the command again to go on")
         raise typer.Exit(1)

@@ -62,6 +62,7 @@ def record_station(
     if duration_s:
         check_duration(duration_s, "--duration-s", most=LONGEST_S)
     from palpate_services.recorder.service import SERVICE, run_recorder
+    from palpate_services.recorder.writer import leftovers
 
     config = parse_config(RecorderConfig, {**EVERYTHING, **settings}, where="command line")
     _check_room(config.out, config.min_free_bytes)
@@ -83,6 +84,9 @@ def record_station(
     )
     written = sorted(set(config.out.glob("*.mcap")) - before)
     summaries = [print_contents(path) for path in written]
+    for part in leftovers(config.out):  # the disk refused its end, and no later one recovered it
+        command = shlex.join(("palpate", "recover", str(part)))
+        print(f"{printable(str(part))} is cut off; its whole messages: {printable(command)}")
     keys = [parse_key(key) for summary in summaries for key in summary.counts]
     if health.counters.get("records_gone"):
         raise RecordingError(

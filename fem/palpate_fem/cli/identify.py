@@ -8,6 +8,7 @@ that method on known parameters, ``validate`` compares simulated with measured f
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -412,7 +413,16 @@ def fit_sensor_command(
     )
     lines = [f"counts at rest are left with {fit.rest_error:.0f} (root mean square)"]
     if fit.learned is not None:
-        lines.append(f"electrodes of these touches deviate by {fit.learned.spread:.0f} counts")
+        degrees = math.degrees(fit.angle_rad)
+        lines += [
+            f"forces of these touches are {degrees:.0f} degrees off the nearest presses (median)",
+            f"electrodes of these touches deviate by {fit.learned.spread:.0f} counts",
+        ]
+    if fit.tells_nothing:
+        lines.append(
+            "these presses do not explain the electrodes: simulate more; if that does not help, "
+            "check that they are E1..E19 in order, raw and live"
+        )
     print_lines(*lines, f"wrote {out}")
 
 

@@ -23,11 +23,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from palpate.errors import DatasetError
 from palpate_fem.electrodes.gap import Gap
 from palpate_fem.electrodes.model import ElectrodeModel
 from palpate_fem.electrodes.sensitivity import AXES, counts_by_parameters
 from palpate_fem.electrodes.specimen import LIMITS, LOG_SD, SENSING, SpecimenParameters
-from palpate_fem.population.explain import Explanation, TouchExplainer, TouchPrior
+from palpate_fem.population.explain import (
+    ANGLE_SD_RAD,
+    SPREAD,
+    Explanation,
+    TouchExplainer,
+    TouchPrior,
+)
 from palpate_fem.population.members import (
     CLAMP_CLOSING,
     CORE_FORWARD_M,
@@ -50,6 +57,10 @@ REST_SPREAD = 50.0
 ones (docs/results/twin/units.md)."""
 KEPT, LEAST_PROBABILITY = 4, 0.02
 """Presses for each touch that a fit of the specimen uses: the most probable, and how probable."""
+
+MOST_ANGLE_RAD = 3 * ANGLE_SD_RAD
+"""Between the forces of touches and those of the nearest presses, median: those of a real sensor
+are off by 10 degrees, with the wrong sign by 110."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,12 +146,20 @@ class SensorFit:
         rest_error: Root mean square of the counts at rest minus its own [counts].
         learned: What its touches teach of others of the same recording; None without touches.
         rounds: To and fro.
+        angle_rad: Between the force of a touch and that of the nearest press, median; NaN without
+            touches.
     """
 
     specimen: SpecimenParameters
     rest_error: float
     learned: TouchPrior | None
     rounds: int
+    angle_rad: float
+
+    @property
+    def tells_nothing(self) -> bool:
+        """Whether the electrodes are no nearer to the presses than before anything is known."""
+        return self.learned is not None and self.learned.spread >= SPREAD
 
     def member(self, touches: int) -> Member:
         """As a member of a population, with what the fit found."""
@@ -168,9 +187,17 @@ def fit_sensor(
         on_round: Called after each with its number and the spread [counts].
 
     Raises:
-        DatasetError: A force is beyond all presses of the library.
+        DatasetError: A force is beyond all presses of the library, or most point elsewhere.
     """
     places = library.candidates(touches.force) if len(touches) else None
+    angle_rad = math.nan if places is None else float(np.median(places.angle_rad.min(axis=1)))
+    if angle_rad > MOST_ANGLE_RAD:
+        raise DatasetError(
+            f"{touches.name}: forces point {math.degrees(angle_rad):.0f} degrees away from those of"
+            " the nearest simulated presses (median)",
+            remedy="give the force on the sensor, not by it, in the sensor frame; or simulate "
+            "presses from that side",
+        )
     start = np.zeros(len(PRIORS) + SENSING)
     at = _fitted(sensor, library, touches, start, [], REST_SPREAD)
     prior, done = TouchPrior(), 0
@@ -187,7 +214,7 @@ def fit_sensor(
     specimen = replace(specimen_at(at, sensor.specimen), name=touches.name)
     rest = sensor.with_specimen(specimen).of_gap(library.rest).counts
     error = float(np.sqrt(np.mean((rest - touches.rest) ** 2)))
-    return SensorFit(specimen, error, prior if len(touches) else None, done)
+    return SensorFit(specimen, error, prior if len(touches) else None, done, angle_rad)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
-from palpate.files.hdf5 import Hdf5Schema, opened, read_array, text
+from palpate.files.hdf5 import Hdf5Schema, check_rows, opened, read_array, rows_sha256, text
 from palpate_fem.electrodes.electronics import FULL_SCALE
 from palpate_fem.electrodes.specimen import SENSING
 
@@ -23,6 +23,11 @@ Floats = NDArray[np.float64]
 
 FEATURES = Hdf5Schema("palpate.features", 1, "use a file made by `palpate data ingest-...`")
 COLUMNS = {"electrodes": "counts", "baseline": "counts", "force": "N", "sensor": "1"}
+DIGESTED = (
+    *("electrodes", "baseline", "force", "group", "block", "sensor", "contact_location"),
+    *("centre_of_pressure", "contact_normal", "in_contact", "time_ns"),
+)
+"""All columns that such a file may have, in the order of its digest."""
 
 HELD_ROWS = 50
 """Half a second at 100 Hz."""
@@ -190,13 +195,19 @@ def read_touches(path: Path, *, sensor: str = "", rows: int = HELD_ROWS) -> Sens
         rows: Shortest stretch that counts as held.
 
     Raises:
-        DatasetError: Not such a file; a column is missing; the sensor is not there, or one of
-            several has to be named; or as `touches_of`.
+        DatasetError: Not such a file; a column is missing; the rows were changed; the sensor is
+            not there, or one of several has to be named; or as `touches_of`.
     """
     with opened(path, extra="fem", missing="make it: palpate data ingest-record") as file:
         FEATURES.check(path, file)
         columns = {name: read_array(path, file, name, unit) for name, unit in COLUMNS.items()}
         names = [text(name) for name in file.attrs.get("sensor_names", ())]
+        if stated := text(file.attrs.get("content_sha256", "")):
+            there = {name: file[name].attrs.get("unit", "") for name in DIGESTED if name in file}
+            arrays = {
+                name: read_array(path, file, name, text(unit)) for name, unit in there.items()
+            }
+            check_rows(path, stated, rows_sha256(names, arrays))
     if sensor not in names and not (sensor == "" and len(names) == 1):
         raise DatasetError(
             f"{path}: {'no sensor ' + repr(sensor) if sensor else 'it holds several sensors'}",

@@ -7,8 +7,9 @@ optional, and imported when a file is opened.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -269,6 +270,34 @@ def read_array(
             remedy=f"convert {name} before writing",
         )
     return array
+
+
+def add_array(digest: hashlib._Hash, name: str, array: npt.NDArray[Any]) -> None:
+    """Add name, type, shape and values of an array to a digest; little-endian on every machine."""
+    little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
+    digest.update(f"{name}:{little.dtype.str}:{little.shape}".encode())
+    digest.update(little.tobytes())
+
+
+def rows_sha256(sensors: Iterable[str], arrays: Mapping[str, npt.NDArray[Any]]) -> str:
+    """SHA-256 of a data set of features, hex: its sensors' names, and arrays in their order."""
+    digest = hashlib.sha256("\n".join(sensors).encode())
+    for name, array in arrays.items():
+        add_array(digest, name, array)
+    return digest.hexdigest()
+
+
+def check_rows(path: Path, stated: str, found: str) -> None:
+    """Refuse a data set whose rows are not those that were written; ``stated`` may be empty.
+
+    Raises:
+        DatasetError: They are not.
+    """
+    if stated and stated != found:
+        raise DatasetError(
+            f"{path}: the content does not match its content_sha256",
+            remedy="the rows were changed after writing; make the file again",
+        )
 
 
 def text(value: object) -> str:

@@ -103,6 +103,8 @@ def read_record(
                     part.sequence,
                 )
         complete = True
+    except RecordingError:  # an OSError, too
+        raise
     except FileNotFoundError as error:
         raise RecordingError(f"{path} does not exist", remedy="check the path") from error
     except OSError as error:
@@ -117,8 +119,6 @@ def read_record(
             f"{path} is no MCAP file", remedy="give a record written by palpate"
         ) from error
     except DAMAGED as error:
-        if isinstance(error, RecordingError):
-            raise
         if not (allow_partial and streams.known and isinstance(error, EOFError)):
             raise RecordingError(
                 f"{path} is damaged or cut off after {count} messages: "
@@ -166,9 +166,13 @@ class _Streams:
                     remedy="give a record written by palpate",
                 )
             if schema.name not in SCHEMAS:
+                upgrade = "read it with the palpate that wrote it, or upgrade palpate"
+                made_for = schema.name.startswith("foxglove.")  # palpate review --foxglove
                 raise RecordingError(
                     f"{self._path}: schema {schema.name!r} is not of contract v{CONTRACT_VERSION}",
-                    remedy="read it with the palpate that wrote it, or upgrade palpate",
+                    remedy="open it in Foxglove; palpate reads the record it was made from"
+                    if made_for
+                    else upgrade,
                 )
             self.known[part.id] = part.topic, parse_key(part.topic), schema.name
 

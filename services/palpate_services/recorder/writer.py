@@ -54,7 +54,7 @@ def free_bytes(folder: Path) -> int:
 def disk_error(folder: Path, why: str) -> DiskError:
     """The error for a disk that is full or refuses to write, with its free space."""
     try:
-        left = f"{free_bytes(folder)} bytes free"
+        left = f"{free_bytes(folder) / 1e6:,.0f} MB free"
     except DiskError:
         left = "free space unknown"
     return DiskError(
@@ -424,7 +424,7 @@ class RecordFiles:
         free = free_bytes(self._config.out)
         self._health.gauge("disk_free_bytes", float(free))
         if free < wanted:
-            raise DiskError(f"less than {wanted} bytes are free", remedy="free some space")
+            raise DiskError(f"less than {wanted / 1e6:,.0f} MB are free", remedy="free some space")
 
     def _check(self, writer: RecordWriter, now_s: float, *, idle: bool) -> None:
         config = self._config

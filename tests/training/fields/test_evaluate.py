@@ -81,6 +81,10 @@ def test_a_synthesis_bundle_is_of_one_specimen(
         evaluate(tmp_path / "synthesis", [path])
     with pytest.raises(DatasetError, match="no 'biotac-9' in it"):
         evaluate(tmp_path / "synthesis", [path], unit="biotac-9")
+    told = ["evaluate", str(tmp_path / "synthesis"), str(path), "--unit", UNIT]
+    shown = CliRunner().invoke(train_app, told, env={"COLUMNS": "300"})
+    assert f"Electrodes of {UNIT}, synthesised" in shown.output
+    assert f": {UNIT}; " in shown.output  # whose they were in training
 
 
 @pytest.fixture(scope="module")

@@ -165,6 +165,11 @@ def train_evaluate(
         )
     elif found.task == "features":
         console.print("Rows in contact, as in_contact says: others are left out.")
+    if found.task == "synthesis":  # no key of its manifest names the specimen, only this line
+        console.print(
+            f"Electrodes of {unit}, synthesised by a network of one specimen: {found.training}",
+            markup=False,
+        )
     if found.trained_on:
         console.print(
             "[bold]It was trained on presses of these data sets:[/bold] these are known to it. Take"

@@ -402,7 +402,10 @@ def train_population_command(
         Path, typer.Argument(metavar="FOLDER", help="For population.npz, .json and .onnx.")
     ],
     device: Device = "auto",
-    seed: Seed = 0,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="Seed of split and weights; none = 0, or as it was trained."),
+    ] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the rows at most.")] = 60,
     batch_rows: Annotated[int, typer.Option(min=1, help="Rows in one step.")] = 4096,
     width: Width = WIDTH,

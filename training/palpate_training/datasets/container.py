@@ -20,6 +20,7 @@ from palpate import __version__
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.hdf5 import (
     Hdf5Schema,
+    add_array,
     h5py_module,
     hdf5_written_whole,
     opened,
@@ -161,13 +162,6 @@ def read_archive(
         raise DatasetError(
             f"{path}: not a readable NumPy archive: {error}", remedy=remedy
         ) from error
-
-
-def add_array(digest: hashlib._Hash, name: str, array: npt.NDArray[Any]) -> None:
-    """Add name, type, shape and values of an array to a digest; little-endian on every machine."""
-    little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
-    digest.update(f"{name}:{little.dtype.str}:{little.shape}".encode())
-    digest.update(little.tobytes())
 
 
 REPEATED_SHARE = 0.01

@@ -5,7 +5,6 @@ On disk: HDF5 schema ``palpate.features`` version 1, written whole or not at all
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -15,13 +14,20 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.files.hdf5 import Hdf5Schema, hdf5_written_whole, opened, read_array, text
+from palpate.files.hdf5 import (
+    Hdf5Schema,
+    check_rows,
+    hdf5_written_whole,
+    opened,
+    read_array,
+    rows_sha256,
+    text,
+)
 from palpate.messages import COUNTS_MAX
 from palpate.messages.estimates import UNIT_TOLERANCE
 from palpate_training.datasets.container import (
     Provenance,
     StoredColumn,
-    add_array,
     joined_provenance,
     read_provenance,
     refuse_repeated,
@@ -109,10 +115,7 @@ class FeatureDataset:
 
     def content_sha256(self) -> str:
         """SHA-256 of names, shapes and values, hex; does not depend on how the file is laid out."""
-        digest = hashlib.sha256("\n".join(self.sensor_names).encode())
-        for name, array in self.arrays().items():
-            add_array(digest, name, array)
-        return digest.hexdigest()
+        return rows_sha256(self.sensor_names, self.arrays())
 
 
 def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureDataset:
@@ -430,10 +433,5 @@ def open_dataset(path: str | Path) -> FeatureDataset:
         provenance=read_provenance(attributes),
         name=str(path),
     )
-    expected = text(attributes.get("content_sha256", ""))
-    if expected and expected != data.content_sha256():
-        raise DatasetError(
-            f"{path}: the content does not match its content_sha256",
-            remedy="the rows were changed after writing; make the file again",
-        )
+    check_rows(path, text(attributes.get("content_sha256", "")), data.content_sha256())
     return data

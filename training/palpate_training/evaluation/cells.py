@@ -31,7 +31,7 @@ import torch
 
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
-from palpate_training.datasets.container import add_array
+from palpate.files.hdf5 import add_array
 from palpate_training.experiment.generate.workers import end_with_parent
 from palpate_training.learning.splits import Fold, RowSplit
 

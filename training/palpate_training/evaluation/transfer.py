@@ -19,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.container import add_array, refuse_repeated
+from palpate.files.hdf5 import add_array
+from palpate_training.datasets.container import refuse_repeated
 from palpate_training.datasets.features import FeatureDataset, period_of
 from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.metrics import force_errors

@@ -140,6 +140,7 @@ class BundleErrors:
         presses: Which these rows are of.
         figures: By name and force.
         trained_on: Whether a data set holds presses that the bundle was trained on.
+        training: What it was trained on, one line for people.
         assumed_contact_n: Force above which rows of a data set without ``in_contact`` count as in
             contact [N]; None where every data set has it, or where all rows count.
     """
@@ -152,6 +153,7 @@ class BundleErrors:
     presses: int
     figures: tuple[Figure, ...]
     trained_on: bool
+    training: str
     assumed_contact_n: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -264,6 +266,7 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
         trained_on=manifest.training_data_sha256 in digests
         # A part of the training, or a copy of it, has another digest.
         or (known is not None and any(holds_known(known, tared) for tared in inputs)),
+        training=manifest.trained_on,
         assumed_contact_n=assumed_n,
     )
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.errors import DatasetError
-from palpate_training.datasets.container import add_array
+from palpate.files.hdf5 import add_array
 from palpate_training.datasets.features import FeatureDataset, of_sensor
 from palpate_training.learning.export import refuse_existing
 from palpate_training.learning.force_process import Floats, KnownRows

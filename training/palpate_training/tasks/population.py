@@ -25,7 +25,7 @@ import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from palpate.errors import BundleError, DatasetError
+from palpate.errors import BundleError, ConfigError, DatasetError
 from palpate.files.atomic import written_whole
 from palpate_training.datasets.features import (
     OF_CONTACT,
@@ -206,7 +206,7 @@ def train_population(
     *,
     config: PopulationConfig,
     device: str = "auto",
-    seed: int = 0,
+    seed: int | None = None,
     measure: bool = False,
     on_epoch: Callable[[], None] | None = None,
 ) -> tuple[PopulationNet, dict[str, Any]]:
@@ -214,10 +214,11 @@ def train_population(
 
     Args:
         path: Features file of a population.
-        out: Folder; what an earlier run left there is replaced.
+        out: Folder; a network that is there is not replaced.
         config: Settings.
         device: Where it is trained: cpu, cuda, or auto = on a GPU if there is one.
-        seed: Of split, weights, order of the rows and noise.
+        seed: Of split, weights, order of the rows and noise; None = 0, or that of the network that
+            is measured.
         measure: Whether the network that the folder holds is measured again, not trained.
         on_epoch: Called after each epoch, for a progress bar.
 
@@ -225,17 +226,27 @@ def train_population(
         The network, and what the report holds.
 
     Raises:
-        ConfigError: There is no GPU, but one is wanted.
-        DatasetError: The data breaks its schema, is no population, or the disk refused.
+        ConfigError: There is no GPU, but one is wanted; or a network is measured with another seed
+            than its own.
+        DatasetError: The data breaks its schema, is no population, or not what the network that is
+            measured was trained on; the folder holds a network; or the disk refused.
     """
     where = training_device(device)
+    if not measure and (out / WEIGHTS).exists():  # refuse before hours of training, not after
+        raise DatasetError(
+            f"{out} holds a network that is trained",
+            remedy="name another folder, or measure that network again with --measure",
+        )
     data = open_dataset(path)
     quantities, rows = rows_of(data)
     targets = rows.targets
-    split = split_population(data, seed=seed)
+    trained: dict[str, Any] = {}
     if measure:
-        net, trained = load_population_net(out / WEIGHTS), _trained_before(out / REPORT)
-    else:
+        net = load_population_net(out / WEIGHTS)
+        seed, trained = _trained_before(out / REPORT, data, seed)
+    seed = seed or 0
+    split = split_population(data, seed=seed)
+    if not measure:
         begun = time.monotonic()
         with torch.device(where):
             if where == "cuda":
@@ -281,12 +292,39 @@ def train_population(
     return net, facts
 
 
-def _trained_before(report: Path) -> dict[str, Any]:
-    """Where the network was trained, by the report beside it; nothing where there is none."""
-    if not report.exists():
-        return {}
-    known = json.loads(report.read_text(encoding="utf-8"))
-    return {key: known[key] for key in ("device", "trained_s") if key in known}
+def _trained_before(
+    report: Path, data: FeatureDataset, seed: int | None
+) -> tuple[int, dict[str, Any]]:
+    """Seed of the network that is measured again, and where it was trained, by its report.
+
+    With other rows or another seed some that it has learned from would count as unseen. What the
+    report does not tell the caller must: a training that was ended before its report has none.
+
+    Raises:
+        ConfigError: It was trained with another seed.
+        DatasetError: It was trained on other data, or neither report nor caller tells the seed.
+    """
+    try:
+        known = json.loads(report.read_text(encoding="utf-8"))
+        own, digest = int(known["seed"]), known["data_sha256"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        if seed is not None:
+            return seed, {}
+        raise DatasetError(
+            f"{report} does not say what the network was trained with: {error!r}",
+            remedy="give --seed as it was trained, and the same data set",
+        ) from error
+    if digest != data.content_sha256():
+        raise DatasetError(
+            f"{data.name} is not the data set of {report}: presses that the network has learned "
+            "from would count as unseen",
+            remedy=f"give the one it was trained on, with content_sha256 {digest}",
+        )
+    if seed not in (None, own):
+        raise ConfigError(
+            f"--seed {seed} is not that of {report}, {own}", remedy="leave --seed out"
+        )
+    return own, {key: known[key] for key in ("device", "trained_s") if key in known}
 
 
 def stop_rows(rows: PopulationRows, chosen: Mask, *, seed: int) -> list[StopRows]:

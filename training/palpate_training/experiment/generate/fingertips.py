@@ -26,6 +26,7 @@ from palpate.cluster import WorkerLostError
 from palpate.errors import ConfigError, PalpateError
 from palpate_training.experiment.generate.pipeline import (
     MECHANICS,
+    SPEC,
     GeneratedExperiment,
     OnStage,
     generate,
@@ -39,6 +40,8 @@ from palpate_training.experiment.generate.simulator import (
 from palpate_training.experiment.generate.workers import end_with_parent, limit_threads
 
 _SEEDS = 1000  # of one experiment on several fingertips; presses are a function of the seed
+
+_FOLDER = "fingertip-"
 
 _AHEAD = 2
 """Fingertips for each device: one is pressed while the trials of another are made."""
@@ -101,7 +104,7 @@ def share_out(
         )
         own = replace(spec, presses=end - first, seed=_SEEDS * spec.seed + number, **fingertip)
         shares.append(
-            FingertipShare(f"fingertip-{number + 1:02d}", own, tuple(specimens[one:other]))
+            FingertipShare(f"{_FOLDER}{number + 1:02d}", own, tuple(specimens[one:other]))
         )
     return tuple(shares)
 
@@ -151,9 +154,19 @@ class SharedExperiment(Generic[Summary]):
             Each, with its summary; None = it was finished before.
 
         Raises:
+            ConfigError: One fingertip is asked for and the folder holds several, or otherwise.
             WorkerLostError: A process died.
             See `generate` for others.
         """
+        if any(share.name for share in shares):
+            others, kind = self.out.glob(SPEC), "one fingertip"
+        else:
+            others, kind = self.out.glob(f"{_FOLDER}*/{SPEC}"), "several fingertips"
+        if other := next(others, None):
+            raise ConfigError(
+                f"{self.out} holds another experiment, on {kind}: {other}",
+                remedy="name another folder",
+            )
         left = []
         for share in shares:
             # One without a name is the whole experiment, whose data sets are made again.

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+from zipfile import is_zipfile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from palpate import __version__
 from palpate.cluster import RayCluster, WorkerLostError
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.atomic import written_whole
+from palpate.files.hdf5 import opened
 from palpate.process import check_installed
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import write_experiment, write_mixed
@@ -122,11 +124,12 @@ def generate(
     for module in ("pinocchio", "threadpoolctl"):  # of trials; told before hours of mechanics
         check_installed(module, extra="training")
     stop = stop or threading.Event()
-    keep_spec(folder, spec, specimens)
     seconds: dict[str, float] = {}
+    claimed = False
     cluster = RayCluster(ray) if ray is not None else None
     processes = WorkerProcesses(workers)
     try:
+        claimed = keep_spec(folder, spec, specimens)
         began = time.monotonic()
         path = folder / STORE
         complete = simulator.simulate(
@@ -175,10 +178,13 @@ def generate(
             raise
         return None  # a signal to the whole group ended workers, too
     finally:
+        # Settings with which no fingertip comes about would refuse those that are put right.
+        if claimed and not (folder / STORE).exists():
+            (folder / SPEC).unlink(missing_ok=True)
         processes.close()
         if cluster is not None:
             cluster.close()
-    if not (folder / IDLE).exists():
+    if not is_zipfile(folder / IDLE):  # not there, or cut off
         pressed = simulator.make_specimens(store.fingertip(), specimens)()
         write_idle(folder, specimens, pressed, seed=spec.seed)
     write_experiment(folder / EXPERIMENT, data.experiment)
@@ -246,8 +252,11 @@ def provenance_sha256(spec: ExperimentSpec, specimens: Sequence[Specimen], finge
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen]) -> None:
+def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen]) -> bool:
     """Write the settings into the experiment's folder, or compare them with those that are there.
+
+    Returns:
+        Whether they were written.
 
     Raises:
         ConfigError: The folder holds another experiment, says what differs; or its settings are
@@ -268,7 +277,7 @@ def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen])
     except (FileNotFoundError, NotADirectoryError):
         with written_whole(path) as part:
             part.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8")
-        return
+        return True
     except OSError as error:
         raise DatasetError(
             f"{path} cannot be read: {error.strerror or error}",
@@ -291,6 +300,7 @@ def keep_spec(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen])
             f"{folder} holds another experiment: {'; '.join(differs)}",
             remedy="go on with the options it was begun with, or name another folder",
         )
+    return False
 
 
 def is_finished(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen]) -> bool:
@@ -298,9 +308,22 @@ def is_finished(folder: Path, spec: ExperimentSpec, specimens: Sequence[Specimen
 
     Raises:
         ConfigError: The folder holds another experiment.
+        DatasetError: One of the data sets is damaged.
     """
+    if not (folder / SPEC).exists():
+        return False
     keep_spec(folder, spec, specimens)
-    return all((folder / name).exists() for name in (EXPERIMENT, MIXED))
+    there = [path for name in (EXPERIMENT, MIXED) if (path := folder / name).exists()]
+    for path in there:
+        try:
+            with opened(path, extra="training"):  # to read all of a large set takes minutes
+                pass
+        except DatasetError as error:
+            raise DatasetError(
+                f"a data set is damaged: {error.problem}",
+                remedy="remove it and run this again: it is made again from the trials",
+            ) from error
+    return len(there) == 2
 
 
 def write_idle(
