@@ -178,17 +178,20 @@ These commands make the presses:
      docs/twin.md [palpate fem]; not run:
      the folders are made by the lines beside it [mkdir] -->
 ```sh
-palpate data generate runs/calibrate --points 3 --angled 2 --seed 11
-palpate data generate runs/check --points 2 --angled 2 --seed 12
-palpate data generate runs/scattered-1 --random 1000 --seed 903 --registration-seed 0 --units-each 2
-palpate data generate runs/scattered-2 --random 1000 --seed 904 --registration-seed 0 --units-each 2
-palpate data generate runs/test --points 2 --angled 2 --seed 13
-palpate data generate runs/random-500 --random 500 --seed 905 --registration-seed 0 --units-each 2
+palpate data generate runs/calibrate --points 3 --angled 2 --seed 11 --exact-labels
+palpate data generate runs/check --points 2 --angled 2 --seed 12 --exact-labels
+palpate data generate runs/scattered-1 --random 1000 --seed 903 --exact-labels \\
+    --registration-seed 0 --units-each 2
+palpate data generate runs/scattered-2 --random 1000 --seed 904 --exact-labels \\
+    --registration-seed 0 --units-each 2
+palpate data generate runs/test --points 2 --angled 2 --seed 13 --exact-labels
+palpate data generate runs/random-500 --random 500 --seed 905 --exact-labels \\
+    --registration-seed 0 --units-each 2
 palpate data shrink runs/random-500/mixed.h5 runs/random-500/small.h5 \\
     --trials 4000 --rows 10 --modes 128 --force-modes 96
 palpate fem units draw 20 --seed 5 --out drawn.json
 mkdir runs/drawn && cp -r runs/test/mechanics.sim runs/drawn/      # the mechanics are the same
-palpate data generate runs/drawn --points 2 --angled 2 --seed 13 --units drawn.json
+palpate data generate runs/drawn --points 2 --angled 2 --seed 13 --units drawn.json --exact-labels
 ```
 
 * The bounds of the shipped bundles were learned from `calibrate`, `check` and both `scattered`

@@ -20,7 +20,10 @@ from palpate_training.tasks.evaluate import SHOWN, evaluate
 PAGE = Path(__file__).parent / "results" / "shipped.md"
 RESULTS = PAGE.with_suffix(".json")
 
-RUNS = {"points": ("calibrate", "check", "test"), "random": ("random",)}
+RUNS = {
+    "points": ("calibrate/mixed.h5", "check/mixed.h5", "test/mixed.h5"),
+    "random": ("random/mixed.h5", "random-500/small.h5"),
+}
 TITLES = {"points": "like the paper's, at other points", "random": "at random"}
 BUNDLES = {"features-twin": None, "field-twin": None, "synthesis-twin": "biotac-2"}
 """By the specimen whose rows are taken; None = all three."""
@@ -60,7 +63,7 @@ def main() -> None:
             presses: [
                 evaluate(
                     resolve(name),
-                    [Path(sys.argv[1]) / run / "mixed.h5" for run in runs],
+                    [Path(sys.argv[1]) / run for run in runs],
                     unit=unit,
                 ).as_dict()
                 for name, unit in BUNDLES.items()
@@ -112,12 +115,18 @@ Made by `python docs/make_shipped.py runs`, on presses that no training has seen
 specimens that ship; simulated fingers only. The same for any bundle and data set:
 `palpate train evaluate BUNDLE DATA`.
 
-<!-- run by: tests/deploy/test_generate.py -->
+<!-- run by: tests/deploy/test_generate.py [palpate data generate],
+     tests/training/fields/test_more_presses.py [palpate data shrink] -->
 ```sh
-palpate data generate runs/calibrate --points 3 --angled 2 --seed 11
-palpate data generate runs/check --points 2 --angled 2 --seed 12
-palpate data generate runs/test --points 2 --angled 2 --seed 13
-palpate data generate runs/random --random 90 --seed 901 --registration-seed 0 --units-each 2
+palpate data generate runs/calibrate --points 3 --angled 2 --seed 11 --exact-labels
+palpate data generate runs/check --points 2 --angled 2 --seed 12 --exact-labels
+palpate data generate runs/test --points 2 --angled 2 --seed 13 --exact-labels
+palpate data generate runs/random --random 90 --seed 901 --exact-labels --registration-seed 0 \\
+    --units-each 2
+palpate data generate runs/random-500 --random 500 --seed 905 --exact-labels --registration-seed 0 \\
+    --units-each 2
+palpate data shrink runs/random-500/mixed.h5 runs/random-500/small.h5 \\
+    --trials 4000 --rows 10 --modes 128 --force-modes 96
 ```
 
 The columns from *below 2 N* on are for rows with such a force. The 95 % interval is over presses.
@@ -125,10 +134,9 @@ The last columns are of all rows. *Constant* is the error of the mean of these r
 no force, a skin at rest and electrodes that do not change. *Paper* is the paper's result on all its
 BioTacs together, on real sensors (for the skin: on its own simulations; for electrodes: on each).
 The bounds of the first two bundles were learned from `calibrate`, `check` and
-[2,000 random presses](intervals.md); no weights were learned from these. The robots of the first
-three sets have other registration errors than those of the training; the errors of the location
-include this difference. The errors of each bundle on presses that its own training held out are on
-[its card](../models.md).
+[2,000 random presses](intervals.md); no weights were learned from these. Locations are where the
+tip was: no registration error of a robot is in them. The errors of each bundle on presses that its
+own training held out are on [its card](../models.md).
 [How they were trained](../twin.md#networks).
 
 {tables}"""

@@ -19,6 +19,7 @@ train_app.command("synthesis")(train.train_synthesis)
 train_app.command("all")(train.train_all)
 train_app.command("report")(report.train_report)
 train_app.command("upgrade")(train.train_upgrade)
+train_app.command("location")(train.train_location)
 train_app.command("intervals")(train.train_intervals)
 train_app.command("evaluate")(report.train_evaluate)
 

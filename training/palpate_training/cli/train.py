@@ -511,6 +511,34 @@ def train_upgrade(
         )
 
 
+def train_location(
+    bundle: Annotated[Path, typer.Argument(help="Folder of a features bundle.")],
+    out: Bundle,
+    exact: Annotated[
+        list[Path],
+        typer.Option(
+            help="Presses (.h5) whose locations are exact, and that no training has seen; "
+            "repeatable.",
+            show_default=False,
+        ),
+    ],
+    seed: Seed = 0,
+) -> None:
+    """Free a bundle's contact location of the registration errors of its training's robots.
+
+    palpate train location models/features-twin/12 new/features --exact runs/e1/mixed.h5
+    """
+    from palpate_training.tasks.location import correct_location
+
+    report = correct_location(bundle, exact, out, seed=seed)
+    console.print(
+        f"location on presses that nothing was learned from: {report.after_m * 1e3:.3f} mm"
+        f" (median), before {report.before_m * 1e3:.3f} mm",
+        markup=False,
+    )
+    console.print(f"wrote {out}, digest {report.digest.hex()}")
+
+
 def train_intervals(
     bundle: Annotated[Path, typer.Argument(help="Folder of a features or field bundle.")],
     out: Bundle,

@@ -179,7 +179,7 @@ def train_features(
         else:
             spread = rms(validated[stopped, part] - truth)
         contact_sd[quantity] = np.asarray(spread, np.float32)
-        metrics |= _contact_report(
+        metrics |= contact_report(
             quantity,
             x,
             wanted,
@@ -345,7 +345,7 @@ def _force_report(
     return metrics
 
 
-def _contact_report(
+def contact_report(
     quantity: str,
     x: FloatArray,
     wanted: FloatArray,

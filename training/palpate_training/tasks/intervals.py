@@ -21,7 +21,13 @@ from palpate.files.intervals import BoundFormula, Intervals
 from palpate.files.training_range import KnownInputs
 from palpate_training.datasets.container import refuse_repeated
 from palpate_training.datasets.experiment import MixedDataset, content_sha256, read_mixed
-from palpate_training.datasets.features import FeatureDataset, FloatArray, open_dataset, press_of
+from palpate_training.datasets.features import (
+    FeatureDataset,
+    FloatArray,
+    of_sensor,
+    open_dataset,
+    press_of,
+)
 from palpate_training.learning.export import refuse_existing, version_of
 from palpate_training.learning.field_code import in_parts
 from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
@@ -226,18 +232,28 @@ def joined(parts: Sequence[HeldOut]) -> HeldOut:
 def _of_others(
     bundle: Bundle, known: KnownInputs, others: Sequence[Path]
 ) -> tuple[tuple[BoundFormula, ...], str]:
-    """Formulas of sensors that the bundle was not made for, and where they come from."""
+    """Formulas of sensors that the bundle was not made for, and where they come from.
+
+    Each sensor counts once, so with fewer than ten the bounds hold for all of them: presses of one
+    are alike, and tell nothing of the next sensor.
+    """
     if not others:
         return (), ""
     if bundle.manifest.task != "features":
         raise DatasetError(
             "no other sensor's fields are known", remedy="give other sensors for features only"
         )
-    sets = [open_dataset(path) for path in others]
-    rows = joined([held_out_features(bundle, data) for data in sets])
+    sensors = [
+        of_sensor(data, name)
+        for data in (open_dataset(path) for path in others)
+        for name in data.sensor_names
+    ]
+    parts = [held_out_features(bundle, sensor) for sensor in sensors]
+    rows = joined(parts)
+    number = np.repeat(np.arange(len(parts)), [len(part.press) for part in parts])
     errors = {name: rows.errors[name] for name in ("force_magnitude", "force")}
-    names = ", ".join(name for data in sets for name in data.sensor_names)
+    names = ", ".join(name for sensor in sensors for name in sensor.sensor_names)
     return (
-        fit_formulas(errors, rows.terms(known), rows.press, use=OF_OTHERS),
-        f"{len(rows.press)} rows of {names}, for which it was not made; another may need more",
+        fit_formulas(errors, rows.terms(known), number, use=OF_OTHERS),
+        f"{len(number)} rows of {names}, for which it was not made; another may need more",
     )
