@@ -121,10 +121,10 @@ specimens that ship; simulated fingers only. The same for any bundle and data se
 palpate data generate runs/calibrate --points 3 --angled 2 --seed 11 --exact-labels
 palpate data generate runs/check --points 2 --angled 2 --seed 12 --exact-labels
 palpate data generate runs/test --points 2 --angled 2 --seed 13 --exact-labels
-palpate data generate runs/random --random 90 --seed 901 --exact-labels --registration-seed 0 \\
-    --units-each 2
-palpate data generate runs/random-500 --random 500 --seed 905 --exact-labels --registration-seed 0 \\
-    --units-each 2
+palpate data generate runs/random --random 90 --seed 901 --exact-labels \\
+    --registration-seed 0 --units-each 2
+palpate data generate runs/random-500 --random 500 --seed 905 --exact-labels \\
+    --registration-seed 0 --units-each 2
 palpate data shrink runs/random-500/mixed.h5 runs/random-500/small.h5 \\
     --trials 4000 --rows 10 --modes 128 --force-modes 96
 ```

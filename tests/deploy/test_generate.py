@@ -354,11 +354,12 @@ def test_the_command_takes_points_a_seed_and_specimens(tmp_path: Path) -> None:
     words = ["generate", str(out), "--points", "1", "--angled", "0", "--seed", "11"]
     words += ["--units", str(units), "--edge-mm", "1.2", "--indenter", "sphere_medium"]
     words += ["--registration-seed", "0", "--layers", "1", "--strain-stiffening", "0.01"]
+    words += ["--exact-labels"]
     done = CliRunner().invoke(twin_app, [*words, "--workers", "1"])
     assert done.exit_code == 0, done.output
     spec = json.loads((out / SPEC_FILE).read_text())["spec"]
     assert (spec["points"], spec["angled"], spec["seed"]) == (1, 0, 11)
-    assert (spec["registration_seed"], spec["layers"]) == (0, 1)
+    assert (spec["registration_seed"], spec["layers"], spec["exact_labels"]) == (0, 1, True)
     fingertip = SimulationStore.open(out / STORE).fingertip()
     assert len(fingertip.mesh.elements) == len(fingertip.mesh.outer_faces)
     assert fingertip.parameters.strain_stiffening == spec["strain_stiffening"] == 0.01

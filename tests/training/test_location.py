@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +31,8 @@ WRONG_M = {True: (0.6e-3, 0.5e-3, -0.8e-3), False: (-0.6e-3, -0.5e-3, -0.8e-3)}
 def presses(data: FeatureDataset, first: int, last: int) -> FeatureDataset:
     """Some presses of a data set."""
     rows = (data.group >= first) & (data.group < last)
-    return replace(data, **{name: values[rows] for name, values in data.arrays().items()})
+    kept: dict[str, Any] = {name: values[rows] for name, values in data.arrays().items()}
+    return replace(data, **kept)
 
 
 def by_robots(data: FeatureDataset) -> FeatureDataset:

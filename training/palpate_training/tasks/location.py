@@ -35,6 +35,7 @@ from palpate_training.tasks.evaluate import read_features
 from palpate_training.tasks.features import contact_report
 
 Floats = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.integer]
 
 LOCATION = "contact_location"
 PRESSES_LEAST = 20
@@ -68,7 +69,7 @@ class _Presses:
     tared: FloatArray
     location: FloatArray
     press: IndexArray
-    group: IndexArray
+    group: Labels
 
 
 def correct_location(
@@ -191,10 +192,10 @@ def _read(exact: Sequence[Path], threshold_n: float) -> tuple[_Presses, list[str
                 f" finger, {PRESSES_LEAST} are needed",
                 remedy="simulate more",
             )
-    return _Presses(tared, location, press, group), sources
+    return _Presses(tared, location, press.astype(np.int32), group), sources
 
 
-def _systematic(presses: _Presses, answer: FloatArray, train: IndexArray) -> Floats:
+def _systematic(presses: _Presses, answer: FloatArray, train: Labels) -> Floats:
     """Error of the location of each row's sensor and side [m], (N, 3): of its presses the median.
 
     Their mean would follow the few presses that are far off.
@@ -203,7 +204,7 @@ def _systematic(presses: _Presses, answer: FloatArray, train: IndexArray) -> Flo
     found, number = np.unique(both, axis=0, return_inverse=True)
     error = (answer[train] - presses.location[train]).astype(np.float64)
     each = np.stack([np.bincount(number, error[:, axis]) for axis in range(3)], axis=1)
-    each /= np.bincount(number)[:, None]
+    each = each / np.bincount(number)[:, None]
     wanted = np.zeros((len(presses.press), 3))
     for group in np.unique(presses.group):
         wanted[presses.group == group] = np.median(each[found[:, 0] == group], axis=0)
