@@ -203,8 +203,8 @@ def _systematic(presses: _Presses, answer: FloatArray, train: Labels) -> Floats:
     both = np.stack([presses.group[train], presses.press[train]], axis=1)
     found, number = np.unique(both, axis=0, return_inverse=True)
     error = (answer[train] - presses.location[train]).astype(np.float64)
-    each = np.stack([np.bincount(number, error[:, axis]) for axis in range(3)], axis=1)
-    each = each / np.bincount(number)[:, None]
+    rows = np.bincount(number)
+    each = np.stack([np.bincount(number, error[:, axis]) / rows for axis in range(3)], axis=1)
     wanted = np.zeros((len(presses.press), 3))
     for group in np.unique(presses.group):
         wanted[presses.group == group] = np.median(each[found[:, 0] == group], axis=0)
