@@ -51,13 +51,13 @@ define run_tests
 	fi; exit $$status
 endef
 
-test: $(VENV)/.dev  ## tests of every file, the gates of `check` among them; what CI runs | MINUTES_TEST min on two cores after setup
+test: $(VENV)/.dev  ## tests of every file, the gates of `check` among them; what CI runs | 12-20 min on two cores after setup
 	$(call run_tests,--tier test)
 
-nightly: $(VENV)/.dev  ## all tests: each night, before a release, after a change that reaches far | MINUTES_ALL min on two cores
+nightly: $(VENV)/.dev  ## all tests: each night, before a release, after a change that reaches far | 30-55 min on two cores
 	$(call run_tests,)
 
-durations: $(VENV)/.dev  ## all tests; measure anew what `quick` and `test` leave out | MINUTES_ALL min on two cores
+durations: $(VENV)/.dev  ## all tests; measure anew what `quick` and `test` leave out | 30-55 min on two cores
 	@$(pytest_parallel) --record-durations
 
 # The gates are written here and nowhere else: tests/house/test_style.py reads and runs these lines.

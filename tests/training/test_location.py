@@ -23,6 +23,8 @@ from palpate_training.tasks.location import correct_location
 
 MakeData = Callable[..., FeatureDataset]
 
+pytestmark = pytest.mark.slow
+
 QUICK = FeaturesNetConfig(members=2, width=32, blocks=1, epochs=20, batch_rows=64)
 WRONG_M = {True: (0.6e-3, 0.5e-3, -0.8e-3), False: (-0.6e-3, -0.5e-3, -0.8e-3)}
 """Registration errors of the arms that press where y >= 0, and elsewhere."""
