@@ -96,6 +96,11 @@ def test_too_few_presses_on_a_side_are_refused(
     assert not (tmp_path / "2").exists()
 
 
+def test_presses_of_the_training_are_refused(trained: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="was trained on presses of"):
+        correct_location(trained, [tmp_path / "train.h5"], tmp_path / "2")
+
+
 def test_a_bundle_without_location_is_refused(exact: FeatureDataset, tmp_path: Path) -> None:
     forces = replace(
         presses(exact, 0, 30), contact_location=None, centre_of_pressure=None, contact_normal=None

@@ -3,9 +3,9 @@
 A robot that stands a little wrong (its registration error) reports each place off by as much, and
 a network learns that of every finger that it can tell from others: the errors of `features-twin` 12
 had the mean of the registration errors of its robots. Presses whose locations are exact show what
-was learned: the mean error of each sensor on each side of the finger, since each side is an arm's.
-What the last layer makes of its inputs is taken for that mean by ridge regression, and subtracted
-from its weights. All other outputs keep their bits.
+was learned: the median error of each sensor on each side of the finger, since each side is an
+arm's. A ridge regression finds what the inputs of the last layer tell of that error, and it is
+subtracted from the layer's weights. All other outputs keep their bits.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from palpate_training.learning.export import (
     version_of,
 )
 from palpate_training.learning.metrics import location_errors, rms
+from palpate_training.learning.ranges import holds_known
 from palpate_training.learning.splits import by_group
 from palpate_training.tasks.evaluate import read_features
 from palpate_training.tasks.features import contact_report
@@ -87,8 +88,8 @@ def correct_location(
     Raises:
         BundleError: It breaks its contract, has no contact location, was exported otherwise, or
             ``out`` exists.
-        DatasetError: A data set breaks its schema, has no locations or too few presses; or the
-            locations do not get better, so nothing is to be taken out.
+        DatasetError: A data set breaks its schema, has no locations or too few presses, or was
+            trained on; or the locations do not get better, so nothing is to be taken out.
     """
     refuse_existing(out)
     bundle = read_bundle(old)
@@ -98,6 +99,11 @@ def correct_location(
             f"{old} gives no contact location", remedy="take a features bundle that does"
         )
     presses, sources = _read(exact, manifest.contact_threshold_n)
+    if bundle.known_inputs is not None and holds_known(bundle.known_inputs, presses.tared):
+        raise DatasetError(
+            f"{old} was trained on presses of {', '.join(map(str, exact))}",
+            remedy="take presses that no training has seen",
+        )
     split = by_group(presses.press, seed=seed)
     layer = _LastLayer(bundle.model)
     answer = layer.location(presses.tared)
@@ -126,10 +132,10 @@ def correct_location(
     given = manifest.inputs[0].name
     golden = dict(bundle.golden)
     (was, _), (now, _) = (run_onnx(one, given, golden[given]) for one in (bundle.model, model))
-    for tensor, before_it, values in zip(manifest.outputs, was, now, strict=True):
+    for tensor, value_before, values in zip(manifest.outputs, was, now, strict=True):
         if tensor.name.startswith(LOCATION):
             golden[tensor.name] = values
-        elif not np.array_equal(values, before_it):
+        elif not np.array_equal(values, value_before):
             raise BundleError(
                 f"{old}: {tensor.name} changes with the location",
                 remedy="report this with the bundle: its graph is another one than palpate writes",
