@@ -51,7 +51,7 @@ define run_tests
 	fi; exit $$status
 endef
 
-test: $(VENV)/.dev  ## tests of every file, the gates of `check` among them; what CI runs | 12-20 min on two cores after setup
+test: $(VENV)/.dev  ## tests of every file, the gates of `check` among them; what CI runs | 6-10 min on two cores after setup
 	$(call run_tests,--tier test)
 
 nightly: $(VENV)/.dev  ## all tests: each night, before a release, after a change that reaches far | 30-55 min on two cores
