@@ -228,6 +228,27 @@ def test_a_bundle_gets_bounds_and_keeps_its_answers(
     assert share > 0.88
 
 
+def test_each_other_sensor_counts_once(press_data: MakeData, trained: Path, tmp_path: Path) -> None:
+    """Bounds hold for every one that is given: its presses tell nothing of the next sensor."""
+    write_dataset(tmp_path / "held.h5", press_data(presses=40, seed=1))
+    sensors = [
+        replace(press_data(presses=30, seed=2 + k), sensor_names=(f"other-{k}",)) for k in range(2)
+    ]
+    # The presses of the second are pieces of one recording.
+    sensors[1] = replace(sensors[1], group=np.zeros_like(sensors[1].group))
+    paths = [tmp_path / f"{k}.h5" for k in range(2)]
+    for path, sensor in zip(paths, sensors, strict=True):
+        write_dataset(path, sensor)
+    add_intervals(trained, [tmp_path / "held.h5"], tmp_path / "2", others=paths)
+    new = read_bundle(tmp_path / "2")
+    assert new.manifest.intervals is not None
+    assert new.known_inputs is not None
+    for sensor in sensors:
+        found = held_out_features(new, sensor)
+        wide = bounds(new.manifest.intervals.others[0], found.terms(new.known_inputs))
+        assert np.mean(found.errors["force_magnitude"] <= wide) > 0.97
+
+
 def test_what_cannot_calibrate_is_refused(
     press_data: MakeData, trained: Path, tmp_path: Path
 ) -> None:
