@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import BundleError, DatasetError
-from palpate.files.bundle import read_bundle, write_bundle
+from palpate.files.bundle import Bundle, read_bundle, write_bundle
 from palpate.process import require
 from palpate_training.datasets.container import refuse_repeated
 from palpate_training.datasets.features import FloatArray, IndexArray, press_of
@@ -29,10 +29,10 @@ from palpate_training.learning.export import (
     session_of,
     version_of,
 )
-from palpate_training.learning.metrics import location_errors, rms
+from palpate_training.learning.metrics import join, location_errors, rms
 from palpate_training.learning.ranges import holds_known
 from palpate_training.learning.splits import by_group
-from palpate_training.tasks.evaluate import read_features
+from palpate_training.tasks.evaluate import answers_of, read_features
 from palpate_training.tasks.features import contact_report
 
 Floats = npt.NDArray[np.float64]
@@ -106,29 +106,30 @@ def correct_location(
         )
     split = by_group(presses.press, seed=seed)
     layer = _LastLayer(bundle.model)
-    answer = layer.location(presses.tared)
+    answer = _locations(bundle, presses.tared)
     wanted = _systematic(presses, answer, split.train)
     weights = layer.ridge(presses.tared[split.train], wanted[split.train], PENALTIES)
-    judged = presses.tared[split.validation]
 
-    def left(without: FloatArray) -> float:
-        truth = presses.location[split.validation]
-        return float(np.median(location_errors(without, truth)["distance_m"]))
+    def error_of(found: FloatArray, rows: Labels) -> float:
+        distance = location_errors(found, presses.location[rows])["distance_m"]
+        return float(np.median(distance))
 
-    best = min(weights, key=lambda one: left(layer.without(one).location(judged)))
-    new = layer.without(best)
-    truth, found = presses.location[split.test], new.location(presses.tared[split.test])
-    before, after = (
-        float(np.median(location_errors(one, truth)["distance_m"]))
-        for one in (answer[split.test], found)
+    def found_without(one: Floats, rows: Labels) -> FloatArray:
+        changed = replace(bundle, model=layer.without(one).model)
+        return _locations(changed, presses.tared[rows])
+
+    best = min(
+        weights, key=lambda one: error_of(found_without(one, split.validation), split.validation)
     )
+    found = found_without(best, split.test)
+    before, after = (error_of(one, split.test) for one in (answer[split.test], found))
     if not after < before:
         raise DatasetError(
             f"{old}: its locations are not off by sensor and side: a median error of"
             f" {before * 1e3:.3f} mm would become {after * 1e3:.3f} mm",
             remedy="keep it as it is",
         )
-    model = new.with_spread(rms(found - truth))
+    model = layer.without(best).with_spread(rms(found - presses.location[split.test]))
     given = manifest.inputs[0].name
     golden = dict(bundle.golden)
     (was, _), (now, _) = (run_onnx(one, given, golden[given]) for one in (bundle.model, model))
@@ -201,6 +202,11 @@ def _read(exact: Sequence[Path], threshold_n: float) -> tuple[_Presses, list[str
     return _Presses(tared, location, press.astype(np.int32), group), sources
 
 
+def _locations(bundle: Bundle, tared: FloatArray) -> FloatArray:
+    """Contact locations of rows of tared counts [m], (N, 3)."""
+    return join(answers_of(bundle, lambda part: tared[part], np.arange(len(tared))))[LOCATION]
+
+
 def _systematic(presses: _Presses, answer: FloatArray, train: Labels) -> Floats:
     """Error of the location of each row's sensor and side [m], (N, 3): of its presses the median.
 
@@ -252,14 +258,10 @@ class _LastLayer:
         ).astype(np.float64)
         self._input = graph.input[0].name
 
-    def location(self, tared: FloatArray) -> FloatArray:
-        """Contact locations of rows of tared counts, (N, 3)."""
-        session = session_of(self._bytes(self._model))
-        parts = [
-            session.run([LOCATION], {self._input: tared[k : k + _PART]})[0]
-            for k in range(0, len(tared), _PART)
-        ]
-        return np.concatenate(parts)
+    @property
+    def model(self) -> bytes:
+        """The whole graph."""
+        return self._bytes(self._model)
 
     def ridge(self, tared: FloatArray, wanted: Floats, penalties: Sequence[float]) -> list[Floats]:
         """Weights (I + 1, 3) that make ``wanted`` (N, 3) of the I inputs of all last layers and 1.
@@ -288,7 +290,7 @@ class _LastLayer:
 
     def without(self, weights: Floats) -> _LastLayer:
         """The same network, whose location has what these weights make subtracted."""
-        new = _LastLayer(self._bytes(self._model))
+        new = _LastLayer(self.model)
         begin = 0
         for _, name, bias_name, spread_name in new._heads:
             spread = new._values(new._constants[spread_name])[new._columns].astype(np.float64)
@@ -303,12 +305,12 @@ class _LastLayer:
         """The model with this standard deviation of the location [m], (3,)."""
         self._set(f"{LOCATION}_spread", np.asarray(spread, np.float32))
         self._onnx.checker.check_model(self._model, full_check=True)
-        return self._bytes(self._model)
+        return self.model
 
     def _hidden(self, tared: FloatArray) -> Iterator[tuple[slice, Floats]]:
         """Inputs of all last layers, (rows, 1 or 2, I): of a row and of its mirror image."""
         names = [head[0] for head in self._heads]
-        shown = self._onnx.load_from_string(self._bytes(self._model))
+        shown = self._onnx.load_from_string(self.model)
         for name in names:
             shown.graph.output.append(
                 self._onnx.helper.make_tensor_value_info(name, self._onnx.TensorProto.FLOAT, None)
