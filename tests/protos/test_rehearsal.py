@@ -81,3 +81,32 @@ def test_not_while_messages_follow_one_another(
             last_s = time.monotonic()
     assert sum(when_s > last_s for when_s in rehearsed) <= 1
     assert len(rehearsed) < FRAMES // 2
+
+
+def test_who_needs_longer_begins_earlier(
+    pair: tuple[Session, Session], frame_of: Callable[..., ElectrodeFrame]
+) -> None:
+    """So that the frame does not find it still rehearsing: a large network takes that long."""
+    sender, receiver = pair
+    begins: dict[float, dict[int, float]] = {0.0: {}, 0.0018: {}}
+
+    def consume(takes_s: float) -> None:
+        def rehearse(last: ReceivedMessage[ElectrodeFrame]) -> None:
+            begins[takes_s][last.message.stamp.sequence] = time.monotonic()
+            time.sleep(takes_s)
+
+        frames = receiver.subscriber(ELECTRODES, sensor="finger", rehearse=rehearse)
+        while frames.next_batch(1.0):
+            pass
+
+    consumers = [threading.Thread(target=consume, args=(takes_s,)) for takes_s in begins]
+    for consumer in consumers:
+        consumer.start()
+    with stream(sender, frame_of, 0.01):
+        pass
+    for consumer in consumers:
+        consumer.join()
+    quick, slow = begins.values()
+    both = sorted(quick.keys() & slow.keys())[10:]
+    earlier = sum(slow[sequence] < quick[sequence] for sequence in both)
+    assert earlier > len(both) / 2 > 5

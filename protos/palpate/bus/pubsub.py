@@ -47,6 +47,11 @@ _LEAD_S = 0.0014
 """So long before the next frame of a sensor is due a waiting consumer gets ready for what comes of
 it [s]: all consumers before the frame, so that none is in the way of another's work on it."""
 
+_MARGIN_S = 0.0003
+_LEAD_MOST_S = 0.0025
+"""Who needs long to get ready, with a large network on a slow host, begins earlier, so that this
+ends ``_MARGIN_S`` before the frame; not earlier than this, which would be a waste [s]."""
+
 _PAUSE_LEAST_S, _PAUSE_MOST_S = 0.004, 0.05
 """After a shorter pause the consumer still is ready; for a longer one it would be a waste [s]."""
 
@@ -297,6 +302,7 @@ class Subscriber(Generic[M], Closing):
         self._rehearse = rehearse
         self._last: ReceivedMessage[M] | None = None
         self._ready_s = math.inf
+        self._rehearsal_s = 0.0
         self._counters: Counter[str] = Counter()
         self._sources: dict[str, _Source[M]] = {}
         self._forgot_ns = 0
@@ -392,9 +398,13 @@ class Subscriber(Generic[M], Closing):
         last = self._last
         if last is None:
             return
+        began_s = time.monotonic()
         self._decode(last.payload)
         if self._rehearse is not None:
             self._rehearse(last)
+        # A longer one counts at once, a shorter one little by little.
+        took_s = min(time.monotonic() - began_s, _LEAD_MOST_S)
+        self._rehearsal_s = max(took_s, self._rehearsal_s + 0.05 * (took_s - self._rehearsal_s))
 
     def latest(self, max_age_s: float, *, sensor: str | None = None) -> ReceivedMessage[M]:
         """The newest valid message (of a sensor), if it is not older than ``max_age_s``.
@@ -531,7 +541,8 @@ class Subscriber(Generic[M], Closing):
                 sampled_s = _sampled_s(message)
                 pause_s = sampled_s - _sampled_s(last)
                 if _PAUSE_LEAST_S < pause_s < _PAUSE_MOST_S:
-                    self._ready_s = sampled_s + pause_s - _LEAD_S
+                    lead_s = min(max(_LEAD_S, self._rehearsal_s + _MARGIN_S), _LEAD_MOST_S)
+                    self._ready_s = sampled_s + pause_s - lead_s
                 else:
                     self._ready_s = math.inf
         if len(source.waiting) >= self._depth:
