@@ -102,49 +102,47 @@ def _latency() -> str:
             if (load := values.get(f"load.{name}"))
         ),
     )
-    text += _of_twin()
-    slow = _read("e2e-slow-host")
-    load = slow["load.features"]
-    text += (
-        "\n**Not on every host.** The same command on a host half as fast (its floor has a median "
-        f"of {_ms(slow['e2e.floor']['p50_s'])}), later and with a later commit: p50 "
-        f"{_ms(slow['e2e.palpate']['p50_s'])} and p99 {_ms(slow['e2e.palpate']['p99_s'])}, "
-        f"{slow['e2e.p50_ratio']:.2f} and {slow['e2e.p99_ratio']:.2f} times the floor, so both "
-        f"goals are missed; of 40 fingers {load['lost']:,} of {load['published']:,} frames were "
-        "lost. The host explains most of it: there "
-        f"`{slow['e2e.compared']['command']}` ran twice with the commit before that day's changes "
-        f"({_compared(slow, '8e68281')} the floor) and twice with the one after them "
-        f"({_compared(slow, '83d57ee')} the floor), both with the later benchmark.\n"
-    )
+    text += _other_hosts()
     command = f"palpate bench e2e --runs {len(values['e2e.runs'])}"
     return _section("Latency beside a bare floor", command, values, text)
 
 
-def _of_twin() -> str:
-    """The same with the largest network that ships."""
-    values = _read("e2e-twin")
-    ours, floor, stages = (values[f"e2e.{name}"] for name in ("palpate", "floor", "stages_s"))
-    load, machine, small = (values[key] for key in ("load.features", "machine", "e2e.compared"))
+def _other_hosts() -> str:
+    """The same on other hosts, and with the largest network that ships."""
+    rows = []
+    for name, host in (
+        ("e2e-16-cores", "a quiet one of 16 cores"),
+        ("e2e-16-cores-twin", "the same"),
+        ("e2e-twin", "a busy one of 2 cores"),
+        ("e2e-slow-host", "a busy one, half as fast"),
+    ):
+        values = _read(name)
+        ours, floor, load = (
+            values.get(key) for key in ("e2e.palpate", "e2e.floor", "load.features")
+        )
+        machine, runs = values["machine"], len(values["e2e.runs"])
+        rows.append(
+            (
+                f"{host} ({machine['cpus']}, {machine['cpu']})",
+                f"`{values.get('e2e.bundle', 'features-virtual')}`",
+                str(runs),
+                f"{_ms(ours['p50_s'])}, {_ms(ours['p99_s'])}",
+                f"{_ms(floor['p50_s'])}, {_ms(floor['p99_s'])}",
+                f"{values['e2e.p50_ratio']:.2f}, {values['e2e.p99_ratio']:.2f}",
+                str(int(sum(run["palpate"]["lost"] for run in values["e2e.runs"]))),
+                f"{load['lost']:,} of {load['published']:,}" if load else "",
+            )
+        )
     return (
-        f"\n**A larger network.** `{values['e2e.bundle']}`, which the profile `virtual` serves, "
-        "has weights of 11 MB, which the processor has to fetch for each frame. "
-        f"`palpate bench e2e --bundle features-twin --runs {len(values['e2e.runs'])}` on a slower "
-        f"host ({machine['cpus']} cores, {machine['cpu']}): p50 {_ms(ours['p50_s'])} and p99 "
-        f"{_ms(ours['p99_s'])}, the floor {_ms(floor['p50_s'])} and {_ms(floor['p99_s'])}, ratios "
-        f"{values['e2e.p50_ratio']:.2f} and {values['e2e.p99_ratio']:.2f}; inference "
-        f"{_ms(stages['infer'])}; of {load['sensors']} fingers {load['lost']:,} of "
-        f"{load['published']:,} frames were lost. With `{small['bundle']}` there: p50 "
-        f"{_ms(small['p50_s'])}, the floor {_ms(small['floor_p50_s'])}, inference "
-        f"{_ms(small['infer_s'])}, {small['lost']:,} frames lost (`{small['command']}`).\n"
-    )
-
-
-def _compared(values: dict[str, Any], commit: str) -> str:
-    """The median latencies of a commit's runs, and their ratios to the floor."""
-    runs = values["e2e.compared"][commit]
-    return (
-        f"p50 {' and '.join(_ms(run['p50_s']) for run in runs)}, "
-        f"{' and '.join(format(run['p50_ratio'], '.2f') for run in runs)} times"
+        "\n**Other hosts, and a larger network.** `features-twin`, which the profile `virtual` "
+        "serves, has weights of 11 MB, which the processor has to fetch for each frame "
+        "(`palpate bench e2e --bundle features-twin`).\n\n"
+        + _table(
+            "host | bundle | runs | p50, p99 | floor | ratios (goals 1.15, 1.3) | lost "
+            "| 40 fingers: lost",
+            rows,
+        )
+        + "\nAll hosts are virtual machines.\n"
     )
 
 

@@ -48,6 +48,7 @@ def test_gateway_and_service_import_nothing_once_they_serve(
 ) -> None:
     """Their first report imported NumPy's masked arrays, for percentiles: up to 3 frames lost."""
     _, link = station
+
     def have_reported() -> bool:
         with Session.open(link, station="test") as session:
             gauges = [gauge for status in ask_status(session) for gauge in status.gauges]
