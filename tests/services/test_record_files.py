@@ -382,6 +382,26 @@ def test_unflushed_samples_are_counted_as_lost_when_the_disk_refuses(
         assert health.counters["lost_disk_full"] == sent - kept > 1, how
 
 
+def test_a_disk_that_refuses_the_tare_of_a_frame_is_survived(
+    open_files: Any,
+    make_frame: Frames,
+    make_tare: Callable[..., Tare],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(record_writer, "FLUSH_S", 0.0)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with open_files(lambda _, tare_id: make_tare(tare_id)) as (files, health):
+        (part,) = (tmp_path / "runs").glob("*.part")
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (part.stat().st_size, hard))
+            files.write(sample_of(ELECTRODE_FRAME.encode(make_frame(1, tare_id=5))))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert health.state is ServiceState.DEGRADED
+    assert health.counters["lost_disk_full"] == 2, "the frame and its tare"
+
+
 @pytest.mark.parametrize("size", [0, 1, 7])
 def test_part_without_even_a_head_is_removed(tmp_path: Path, size: int) -> None:
     """A disk that refuses to write leaves one with each attempt."""

@@ -269,6 +269,9 @@ class RecordFiles:
             self._tares.add((sample.sensor, message.tare_id))
         elif isinstance(message, ElectrodeFrame):
             self._write_tare_of(message, sample)
+            if self._writer is None:  # the disk refused the tare
+                self._counts["lost_disk_full"] += 1
+                return
         stream = f"{sample.sensor}/{sample.topic}"
         field_stamp = stamp if topic in _FIELDS else None
         if field_stamp is not None and self._field_rate.reached(stream, field_stamp):
