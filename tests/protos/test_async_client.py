@@ -20,7 +20,8 @@ from tests.protos.robot_client import (
 )
 
 from palpate import AsyncClient, Client
-from palpate.bus import Session, endpoints
+from palpate.bus import Cancellation, Session, endpoints
+from palpate.client.aio import _AT_ONCE
 from palpate.config import LinkConfig
 from palpate.errors import (
     ConfigError,
@@ -221,6 +222,31 @@ def test_cancelling_a_task_ends_its_question_and_its_stream(
         lambda: not [one for one in threading.enumerate() if one.name.startswith("palpate c")],
         timeout_s=LIVE_S,
     )
+
+
+def test_calls_that_take_all_threads_are_cancelled() -> None:
+    begun: list[Cancellation] = []
+    cancelled: list[bool] = []
+
+    def call() -> None:
+        cancellation = Cancellation.current()
+        assert cancellation is not None
+        begun.append(cancellation)
+        cancelled.append(cancellation.cancelled.wait(LIVE_S))
+
+    async def scene() -> None:
+        robot = AsyncClient()
+        calls = [asyncio.create_task(robot.in_thread(call)) for _ in range(_AT_ONCE)]
+        while len(begun) < _AT_ONCE:
+            await asyncio.sleep(0.01)
+        for one in calls:
+            one.cancel()
+        while len(cancelled) < _AT_ONCE:
+            await asyncio.sleep(0.01)
+        await robot.aclose()
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+    assert all(cancelled), "none ends by its own time"
 
 
 def test_a_simulation_reports_into_the_loop_and_is_stopped_with_its_task(

@@ -195,6 +195,8 @@ class AsyncClient:
         self._client: Client | None = None
         self._streams: list[AsyncStream[Any]] = []
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="palpate call")
+        # Of its own: calls to be cancelled may have all of the others.
+        self._canceller = ThreadPoolExecutor(1, thread_name_prefix="palpate cancel")
 
     features = _awaitable(Client.features)
     electrodes = _awaitable(Client.electrodes)
@@ -282,7 +284,7 @@ class AsyncClient:
         try:
             return await future
         except asyncio.CancelledError:
-            self._threads.submit(cancellation.cancel)
+            self._canceller.submit(cancellation.cancel)
             raise
 
     def keep(self, stream: AsyncStream[Any]) -> None:
@@ -299,7 +301,11 @@ class AsyncClient:
         client, self._client = self._client, None
         if client is not None:
             await self.in_thread(client.close)
-        self._threads.shutdown(wait=False)
+        self._end_threads()
+
+    def _end_threads(self) -> None:
+        for threads in (self._threads, self._canceller):
+            threads.shutdown(wait=False)
 
     async def __aenter__(self) -> Self:
         opening = self._threads.submit(self._open)
@@ -310,7 +316,7 @@ class AsyncClient:
             raise
         finally:
             if self._client is None:
-                self._threads.shutdown(wait=False)
+                self._end_threads()
         return self
 
     async def __aexit__(
