@@ -172,6 +172,21 @@ def test_fields_of_an_unknown_mesh_are_counted(record: Path, tmp_path: Path) -> 
     assert counts["view_no_mesh"] == 2 * len(FORCES)
 
 
+def test_an_invalid_message_is_copied_and_not_drawn(
+    make_frame: Frames, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "lab.mcap"
+    codec, key = TOPICS["electrodes"].codec, sensor_key("lab", "left", "electrodes")
+    payloads = [codec.encode(make_frame(1)), b"\xff\xff", codec.encode(make_frame(2))]
+    with RecordWriter(path) as writer:
+        for payload in payloads:
+            writer.write(key, codec.schema, payload, log_time_ns=1)
+    counts = export_foxglove(path, tmp_path / "f.mcap")
+    assert messages_of(tmp_path / "f.mcap")[key] == payloads
+    assert counts["view_rejected"] == 1
+    assert "f.mcap: 1 messages break the contract" in caplog.text
+
+
 def test_a_damaged_record_leaves_no_file(record: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(record.read_bytes()[:-200])
