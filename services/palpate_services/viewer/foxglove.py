@@ -64,7 +64,8 @@ def export_foxglove(record: Path, out: Path, *, bundles: Sequence[str] = ()) -> 
 
     Returns:
         Messages of each topic of the scene; ``view_no_mesh``, fields whose mesh no bundle has;
-        ``view_rejected``, messages that break the contract, which are copied and not drawn.
+        ``view_wrong_mesh``, fields with other nodes than their mesh; ``view_rejected``, messages
+        that break the contract, which are copied and not drawn.
 
     Raises:
         ConfigError: ``out`` is a record, or one of ``bundles`` does not exist.
@@ -157,13 +158,13 @@ class _Scenes:
                 self._field(sensor, name, field)
 
     def _field(self, sensor: str, name: str, field: FieldRow) -> None:
-        skin = self._skins.get(field.mesh_sha256)
+        mesh = self._meshes.find(field.mesh_sha256)
+        if mesh is None or field.displacement.shape != mesh.nodes.shape:
+            self.counts["view_no_mesh" if mesh is None else "view_wrong_mesh"] += 1
+            return
+        skin = self._skins.get(mesh.sha256)
         if skin is None:
-            mesh = self._meshes.find(field.mesh_sha256)
-            if mesh is None or field.displacement.shape != mesh.nodes.shape:
-                self.counts["view_no_mesh"] += 1
-                return
-            skin = self._skins[field.mesh_sha256] = OuterSkin(mesh)
+            skin = self._skins[mesh.sha256] = OuterSkin(mesh)
         entity = _entity(sensor, f"skin/{name}", field.time_ns)
         moved = field.displacement[skin.used]
         triangles = entity.triangles.add()
