@@ -432,6 +432,23 @@ def test_leftovers_are_recovered_but_not_those_of_the_living(
     assert not list(runs.glob("*.part"))
 
 
+def test_a_recovery_that_was_killed_is_done_again_at_the_next_start(
+    sample: Callable[[int], TapSample], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    item = sample(1)
+    writer = RecordWriter(tmp_path / "lab-dead.mcap")
+    writer.write(item.key, item.schema, item.payload, log_time_ns=1, sequence=1)
+    writer.flush()
+    writer.abandon()
+    half = shutil.copy(writer.part, tmp_path / "lab-dead.recovered.mcap.part")
+    for part in (writer.part, half):
+        os.utime(part, (0, 0))
+    (found,) = recover_all(leftovers(tmp_path))
+    assert list(tmp_path.iterdir()) == [found.path]
+    assert found.path.name == "lab-dead.recovered.mcap"
+    assert caplog.text == ""
+
+
 def test_view_that_fails_leaves_the_record_alone(
     open_files: Any,
     sample: Callable[[int], TapSample],

@@ -99,7 +99,7 @@ def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> l
             # A recovery that was itself killed, its source is still there; or a recorder that was
             # killed before its first write was whole.
             if part.name.endswith(f"{RECOVERED}{PART}") or part.stat().st_size < _HEAD_BYTES:
-                part.unlink()
+                part.unlink(missing_ok=True)
             else:
                 done.append(recover(part))
         except (RecordingError, OSError) as error:
