@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from palpate import heartbeat
 from palpate.bus import TapSample
 from palpate.bus.topics import ELECTRODES, TARE, sensor_key
 from palpate.codec import ELECTRODE_FRAME
@@ -183,6 +184,34 @@ def test_rotation_by_size_loses_nothing(
     assert len(records) > 1
     sequences = [item.sequence for record in records for item in read_record(record)]
     assert sequences == list(range(1, 1501))
+
+
+def test_a_slow_disk_has_time_to_close_a_record(
+    open_files: Any,
+    sample: Callable[[int], TapSample],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The thread that beats waits for it: a recorder was ended as one that hangs."""
+    pulse = tmp_path / "pulse"
+    monkeypatch.setenv(heartbeat.FILE_VARIABLE, str(pulse))
+    monkeypatch.setattr(heartbeat, "_of_this_process", None)
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
+    allowed_s: list[float] = []
+
+    def slow(_: int) -> None:
+        found = heartbeat.read_pulse(pulse)
+        assert found is not None
+        allowed_s.append(found.allowed_ns * 1e-9)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    with open_files(rotate_bytes=64 * 1024) as (files, _):
+        for sequence in range(1, 1001):
+            heartbeat.beat()
+            files.write(sample(sequence))
+            files.tick(idle=sequence % 100 == 0)
+    assert len(allowed_s) > 1
+    assert min(allowed_s) >= 30.0
 
 
 def test_too_little_space_is_reported_and_recording_resumes(

@@ -21,6 +21,7 @@ from palpate.errors import ErrorCode, RecordingError, WireError
 from palpate.files.record import Recovery, is_being_written, recover
 from palpate.files.record_writer import RecordGone, RecordWriter
 from palpate.health import Health
+from palpate.heartbeat import beat
 from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
 from palpate_services.config import RecorderConfig
 from palpate_services.inference.loop import RateLimit
@@ -163,6 +164,10 @@ a full disk must be reported within a second, a killed recorder must lose no mor
 RESUME_MARGIN_BYTES = 1024**2
 """Recording resumes only with this much more than ``min_free_bytes``: without the margin it would
 start and stop in turn."""
+
+CLOSE_S = 60.0
+"""How long a slow disk may take to close a record, in the thread that beats [s]: it waits until all
+is on the disk."""
 
 VIEW_CLOSE_S = 5.0
 """How long a stopping recorder waits for its view to be completed [s]."""
@@ -502,6 +507,7 @@ class RecordFiles:
         view, self._view = self._view, None
         problem = None
         if writer is not None:
+            beat(CLOSE_S)
             try:
                 writer.close()
             except RecordGone as gone:
