@@ -6,6 +6,7 @@ import os
 import resource
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -496,6 +497,35 @@ def test_view_that_fails_leaves_the_record_alone(
     (record,) = (tmp_path / "runs").glob("*.mcap")
     assert [item.sequence for item in read_record(record)] == list(range(1, 21))
     assert health.counters["view_failed"] == 1
+
+
+def test_what_a_view_counts_last_is_not_lost(
+    open_files: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Ending:
+        """Its thread counts once more, and ends, while the counts of all views are gathered."""
+
+        def __init__(self, _: ViewPlan) -> None:
+            self.counts: Counter[str] = Counter()
+
+        def take_counts(self) -> Counter[str]:
+            counts, self.counts = self.counts, Counter()
+            return counts
+
+        def join(self, _: float) -> bool:
+            self.counts["view_no_mesh"] += 1
+            return True
+
+        def finish(self) -> None:
+            pass
+
+        def close(self, _: float) -> None:
+            pass
+
+    monkeypatch.setattr(writer_module, "LiveView", Ending)
+    with open_files(rrd=True) as (_, health):
+        pass
+    assert health.counters["view_no_mesh"] == 1
 
 
 def test_view_stops_at_its_size(make_frame: Frames, tmp_path: Path) -> None:

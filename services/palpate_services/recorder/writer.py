@@ -370,10 +370,12 @@ class RecordFiles:
     def report(self) -> None:
         """Hand the counters to health."""
         counts, self._counts = self._counts, Counter()
+        # Views of earlier records stay in the list until their threads have ended, to be counted:
+        # asked before, because a thread may still count between the two.
+        going_on = [v for v in self._views if v is self._view or not v.join(0.0)]
         for view in self._views:
             counts.update(view.take_counts())
-        # Views of earlier records stay in the list until their threads have ended, to be counted.
-        self._views = [v for v in self._views if v is self._view or not v.join(0.0)]
+        self._views = going_on
         for name, count in counts.items():
             self._health.count(name, count)
         size = 0 if self._writer is None else self._writer.bytes_written
