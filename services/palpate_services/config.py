@@ -119,7 +119,6 @@ class FieldServiceConfig(ElectrodesConfig):
     """
 
     bundle: str = "field-twin"
-    keep_newest: int = Field(default=5, ge=1, le=100)
     max_age_s: float | None = Field(default=0.1, gt=0)
     rate_hz: float | None = Field(default=20.0, gt=0, le=1000)
 
