@@ -184,7 +184,9 @@ FindTare = Callable[[str, int], Tare | None]
 
 
 class RecordFiles:
-    """Writes samples to the present record, and draws them into its view. Use from one thread.
+    """Writes samples to the present record, and draws them into its view.
+
+    Use from one thread, but for ``other_trouble_is_over``.
 
     Frames name their tare. One that was taken before the record began is looked up and recorded,
     too: without it nobody could read the frames.
@@ -222,6 +224,7 @@ class RecordFiles:
         self._checked_s = 0.0
         self._tried_s = float("-inf")
         self._told = False  # of the present trouble with the disk
+        self._says_ready = False
         self._recovery = RecordRecovery(config.out, health)
         MeshLibrary(config.bundles)  # raises for one that is missing, which a view would only log
         self._retention = retention.Retention(config, station, health)
@@ -349,6 +352,9 @@ class RecordFiles:
         if now_s - self._checked_s < CHECK_S:
             return
         self._checked_s = now_s
+        if self._says_ready:
+            self._says_ready = False
+            self._say_ready()
         if self._writer is None:
             self._try_to_resume(now_s)
         else:
@@ -415,12 +421,15 @@ class RecordFiles:
             self._view = LiveView(plan)
             self._views.append(self._view)
         self._path = path
-        self.says_ready()
+        self._say_ready()
         self._counts["records_opened"] += 1
         _log.info("recording to %s", path)
 
-    def says_ready(self) -> None:
-        """Say that it records, if it does; after a trouble of another kind is over."""
+    def other_trouble_is_over(self) -> None:
+        """Have the next ``tick`` say that it records, if it does; from any thread."""
+        self._says_ready = True
+
+    def _say_ready(self) -> None:
         if self._writer is not None:
             self._health.set_state(ServiceState.READY, f"recording to {self._path}")
 
