@@ -127,8 +127,9 @@ class CommandGuard:
     def __init__(self, token: bytes | None, *, station: str, service: str, instance: str) -> None:
         self._token = token
         self._station, self._service, self._instance = station, service, instance
-        # Numbers of past commands are forgotten with the process: older commands do not pass.
-        self._began_ns = time.time_ns()
+        # Numbers of past commands are forgotten with the process: older commands do not pass. By
+        # the monotonic clock: the wall clock may be set back by hours after a start.
+        self._began_ns = time.monotonic_ns()
         self._used: dict[bytes, int] = {}
         self._lock = threading.Lock()
 
@@ -150,7 +151,8 @@ class CommandGuard:
             _deny(f"the command is for {'/'.join(meant)}, not for this process")
         now_ns = time.time_ns()
         age_s = (now_ns - command.wall_ns) * 1e-9
-        if abs(age_s) > CLOCK_S or command.wall_ns < self._began_ns:
+        began_ns = now_ns - (time.monotonic_ns() - self._began_ns)
+        if abs(age_s) > CLOCK_S or command.wall_ns < began_ns:
             _deny(
                 f"the command was given {age_s:.0f} s ago by this host's clock, it holds for "
                 f"{CLOCK_S:g} s",

@@ -13,6 +13,9 @@ from palpate.ros.rmw_zenoh import check_topic_name
 
 DEFAULT_BUNDLE = "features-virtual"
 
+LOADED_MOST = 32
+"""Different bundles that a service has in memory, with those kept for a roll back."""
+
 _UserPath = Annotated[Path, AfterValidator(Path.expanduser)]
 
 
@@ -80,6 +83,16 @@ class EstimatingConfig(StrictConfig):
     batch_wait_s: float = Field(default=0.0, ge=0, le=0.002)
     drain_s: float = Field(default=1.5, ge=0, le=30)
 
+    @field_validator("bundles")
+    @classmethod
+    def _can_be_loaded(cls, value: dict[str, str], info: ValidationInfo) -> dict[str, str]:
+        named = len({*value.values(), info.data.get("bundle", "")})
+        if named > LOADED_MOST:
+            raise ValueError(
+                f"with bundle these are {named} different ones, a service loads {LOADED_MOST}"
+            )
+        return value
+
 
 class ElectrodesConfig(EstimatingConfig):
     """What services that start from electrodes have in common.
@@ -106,7 +119,6 @@ class FieldServiceConfig(ElectrodesConfig):
     """
 
     bundle: str = "field-twin"
-    keep_newest: int = Field(default=5, ge=1, le=100)
     max_age_s: float | None = Field(default=0.1, gt=0)
     rate_hz: float | None = Field(default=20.0, gt=0, le=1000)
 

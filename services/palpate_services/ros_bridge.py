@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from palpate.bus import Delivery, ForeignPublisher, Session, TapSample
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, StreamTimeout, WireError
+from palpate.errors import ConfigError, LinkError, StreamTimeout, WireError
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
 from palpate.messages import FeatureEstimate, ServiceState, WrenchFrame
@@ -170,8 +170,14 @@ class RosBridge:
             self._publisher(sample.sensor, output).put(payload)
         return "passed_on"
 
-    def trouble(self) -> ConfigError | None:
+    def trouble(self) -> ConfigError | LinkError | None:
         """What ROS should get and does not; None = nothing is lost."""
+        if not self._session.has_router():
+            place = f", {self._config.connect}," if self._config.connect else ""
+            return LinkError(
+                f"the router of ROS{place} is gone: its nodes get nothing",
+                remedy="start it again; the bridge goes on by itself",
+            )
         now_s = time.monotonic()
         if self._clash is not None and now_s - self._clash[0] < _CLASH_S:
             return self._clash[1]

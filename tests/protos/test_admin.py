@@ -92,6 +92,22 @@ def test_a_command_from_before_the_start_cannot_be_repeated() -> None:
     assert "ago" in denied(after, request)
 
 
+def test_a_clock_that_is_set_back_after_the_start_refuses_no_new_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A host whose clock is in local time until NTP sets it: commands were refused for hours."""
+    true_ns = time.time_ns
+    with monkeypatch.context() as ahead:
+        ahead.setattr(time, "time_ns", lambda: true_ns() + 3600 * 10**9)
+        guard = CommandGuard(TOKEN, station="lab", service="features", instance="features")
+        time.sleep(0.001)
+    request = signed(command(), TOKEN)
+    assert guard.admit(request).bundle == "x:1"
+    assert "already obeyed" in denied(guard, request)
+    before = signed(command(wall_ns=time.time_ns() - 20 * 10**9), TOKEN)
+    assert "ago" in denied(guard, before)
+
+
 def test_numbers_are_kept_while_they_could_pass_and_no_more(
     guard: CommandGuard, monkeypatch: pytest.MonkeyPatch
 ) -> None:

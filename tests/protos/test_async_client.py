@@ -20,7 +20,8 @@ from tests.protos.robot_client import (
 )
 
 from palpate import AsyncClient, Client
-from palpate.bus import Session, endpoints
+from palpate.bus import Cancellation, Session, endpoints
+from palpate.client.aio import _AT_ONCE
 from palpate.config import LinkConfig
 from palpate.errors import (
     ConfigError,
@@ -29,9 +30,11 @@ from palpate.errors import (
     StreamTimeout,
 )
 from palpate.messages import (
+    FeatureRequest,
     SimulationProgress,
     SimulationReply,
     SimulationRequest,
+    SynthesisRequest,
     Tare,
     TareRequest,
 )
@@ -223,6 +226,31 @@ def test_cancelling_a_task_ends_its_question_and_its_stream(
     )
 
 
+def test_calls_that_take_all_threads_are_cancelled() -> None:
+    begun: list[Cancellation] = []
+    cancelled: list[bool] = []
+
+    def call() -> None:
+        cancellation = Cancellation.current()
+        assert cancellation is not None
+        begun.append(cancellation)
+        cancelled.append(cancellation.cancelled.wait(LIVE_S))
+
+    async def scene() -> None:
+        robot = AsyncClient()
+        calls = [asyncio.create_task(robot.in_thread(call)) for _ in range(_AT_ONCE)]
+        while len(begun) < _AT_ONCE:
+            await asyncio.sleep(0.01)
+        for one in calls:
+            one.cancel()
+        while len(cancelled) < _AT_ONCE:
+            await asyncio.sleep(0.01)
+        await robot.aclose()
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+    assert all(cancelled), "none ends by its own time"
+
+
 def test_a_simulation_reports_into_the_loop_and_is_stopped_with_its_task(
     link: LinkConfig, wait_until: WaitUntil
 ) -> None:
@@ -265,6 +293,43 @@ def test_a_simulation_reports_into_the_loop_and_is_stopped_with_its_task(
     with Session.open(link) as session:
         session.watch_callers(lambda *_: gone.set() if begun.is_set() else None)
         session.stream_queryable(endpoints.SIMULATE, simulate, sensor="twin")
+        asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
+def test_functions_of_a_call_are_called_in_the_loop(
+    link: LinkConfig, examples: dict[str, Any]
+) -> None:
+    part = examples["SynthesisReply"]
+
+    def synthesise(_: SynthesisRequest, answer: Any) -> None:
+        answer.send(part)
+        answer.send(dataclasses.replace(part, more=False))
+        answer.end()
+
+    def estimate(_: FeatureRequest, answer: Any) -> None:
+        answer.send(examples["FeatureEstimate"], timings=examples["StageTimings"])
+        answer.end()
+
+    async def scene() -> None:
+        loop = asyncio.get_running_loop()
+        told: list[str] = []
+
+        def tell(what: object) -> None:
+            assert asyncio.get_running_loop() is loop
+            told.append(type(what).__name__)
+
+        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
+            await robot.synthesise_from(examples["FieldFrame"], on_step=tell)
+            await robot.estimate_features("finger", examples["ElectrodeFrame"], on_timings=tell)
+        assert told == ["SynthesisReply", "StageTimings"]
+
+    with Session.open(link) as session:
+        session.stream_queryable(
+            endpoints.SYNTHESISE_FROM, synthesise, service="synthesis", instance="one"
+        )
+        session.stream_queryable(
+            endpoints.ESTIMATE_FEATURES, estimate, service="features", instance="one"
+        )
         asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
 
 

@@ -135,3 +135,29 @@ def test_nothing_is_left_of_a_bundle_that_is_refused(
             target, model=b"", golden=golden, manifest=dataclasses.replace(manifest, inputs=())
         )
     assert not target.exists()
+
+
+def test_a_bundle_is_on_the_disk_before_it_appears(
+    tmp_path: Path,
+    manifest: Manifest,
+    golden: dict[str, npt.NDArray[np.float32]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After a power failure it is whole or not there: a station serves it at once."""
+    synced: set[str] = set()
+    there: list[set[str]] = []
+    sync, rename = os.fsync, os.rename
+
+    def synced_too(file: int) -> None:
+        sync(file)
+        synced.add(os.readlink(f"/proc/self/fd/{file}"))
+
+    def renamed(made: Path, folder: Path) -> None:
+        there.append({str(made), *map(str, made.iterdir())})
+        assert there[0] <= synced
+        rename(made, folder)
+
+    monkeypatch.setattr(os, "fsync", synced_too)
+    monkeypatch.setattr(os, "rename", renamed)
+    write_bundle(tmp_path / "test" / "1", model=b"onnx", golden=golden, manifest=manifest)
+    assert len(there[0]) == 4, "the folder and its three files"

@@ -98,6 +98,31 @@ def test_a_stream_never_delivers_an_old_reading(finger: Finger, robot: Client) -
         list(stream)
 
 
+def test_a_first_call_that_is_interrupted_costs_no_later_one(
+    finger: Finger, robot: Client, wait_until: WaitUntil
+) -> None:
+    """Ctrl-C in a notebook: the client got no estimate ever after."""
+    finger.silent = True
+    main = threading.main_thread().ident
+    assert main is not None
+    interrupt = threading.Timer(0.3, signal.pthread_kill, (main, signal.SIGINT))
+
+    def ask() -> None:
+        interrupt.start()
+        robot.features("finger")
+
+    with pytest.raises(KeyboardInterrupt):
+        ask()
+    finger.silent = False
+
+    def answered() -> bool:
+        with suppress(StaleError):  # of the time before it sent again
+            return robot.features("finger", max_age_s=LIVE_S).source.sequence > 0
+        return False
+
+    wait_until(answered, timeout_s=LIVE_S)
+
+
 def test_closing_the_client_ends_its_streams(link: LinkConfig, finger: Finger) -> None:
     ended = threading.Event()
     robot = Client(link.connect[0], timeout_s=LIVE_S)

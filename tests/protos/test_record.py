@@ -300,6 +300,11 @@ def test_recovery_replaces_no_other_file_and_leaves_whole_records(
     part.write_bytes(content[:-200])
     assert summarise(recover(part).path).counts == {KEY: 300}
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.recovered.mcap", "run.mcap"]
+    # And so is one that was killed in the middle.
+    part.write_bytes(content[:-200])
+    (tmp_path / "cut.recovered.mcap").rename(tmp_path / "cut.recovered.mcap.part")
+    assert summarise(recover(part).path).counts == {KEY: 300}
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.recovered.mcap", "run.mcap"]
 
 
 def test_a_file_without_a_whole_message_is_not_sent_in_a_circle(tmp_path: Path) -> None:

@@ -172,6 +172,37 @@ def test_fields_of_an_unknown_mesh_are_counted(record: Path, tmp_path: Path) -> 
     assert counts["view_no_mesh"] == 2 * len(FORCES)
 
 
+def test_a_field_with_other_nodes_than_its_mesh_is_counted(
+    make_frame: Frames, tmp_path: Path
+) -> None:
+    path, stamp = tmp_path / "lab.mcap", make_frame(1).stamp
+    codec, key = TOPICS["field"].codec, sensor_key("lab", "left", "field")
+    with RecordWriter(path) as writer:
+        for number, nodes in enumerate((None, 3, None)):
+            now = dataclasses.replace(stamp, wall_ns=stamp.wall_ns + 10**9 * number)
+            field = bundles.guess(now, depth_m=1e-4 * number)
+            field = dataclasses.replace(field, displacement=field.displacement[:nodes])
+            writer.write(key, codec.schema, codec.encode(field), log_time_ns=now.wall_ns)
+    mine = str(bundles.write(tmp_path / "mine", "field"))
+    counts = export_foxglove(path, tmp_path / "f.mcap", bundles=[mine])
+    assert (counts["view_wrong_mesh"], counts["/left/scene"]) == (1, 2)
+
+
+def test_an_invalid_message_is_copied_and_not_drawn(
+    make_frame: Frames, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "lab.mcap"
+    codec, key = TOPICS["electrodes"].codec, sensor_key("lab", "left", "electrodes")
+    payloads = [codec.encode(make_frame(1)), b"\xff\xff", codec.encode(make_frame(2))]
+    with RecordWriter(path) as writer:
+        for payload in payloads:
+            writer.write(key, codec.schema, payload, log_time_ns=1)
+    counts = export_foxglove(path, tmp_path / "f.mcap")
+    assert messages_of(tmp_path / "f.mcap")[key] == payloads
+    assert counts["view_rejected"] == 1
+    assert "f.mcap: 1 messages break the contract" in caplog.text
+
+
 def test_a_damaged_record_leaves_no_file(record: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(record.read_bytes()[:-200])

@@ -6,6 +6,7 @@ import os
 import resource
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from palpate import heartbeat
 from palpate.bus import TapSample
 from palpate.bus.topics import ELECTRODES, TARE, sensor_key
 from palpate.codec import ELECTRODE_FRAME
@@ -183,6 +185,34 @@ def test_rotation_by_size_loses_nothing(
     assert len(records) > 1
     sequences = [item.sequence for record in records for item in read_record(record)]
     assert sequences == list(range(1, 1501))
+
+
+def test_a_slow_disk_has_time_to_close_a_record(
+    open_files: Any,
+    sample: Callable[[int], TapSample],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The thread that beats waits for it: a recorder was ended as one that hangs."""
+    pulse = tmp_path / "pulse"
+    monkeypatch.setenv(heartbeat.FILE_VARIABLE, str(pulse))
+    monkeypatch.setattr(heartbeat, "_of_this_process", None)
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
+    allowed_s: list[float] = []
+
+    def slow(_: int) -> None:
+        found = heartbeat.read_pulse(pulse)
+        assert found is not None
+        allowed_s.append(found.allowed_ns * 1e-9)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    with open_files(rotate_bytes=64 * 1024) as (files, _):
+        for sequence in range(1, 1001):
+            heartbeat.beat()
+            files.write(sample(sequence))
+            files.tick(idle=sequence % 100 == 0)
+    assert len(allowed_s) > 1
+    assert min(allowed_s) >= 30.0
 
 
 def test_too_little_space_is_reported_and_recording_resumes(
@@ -382,6 +412,26 @@ def test_unflushed_samples_are_counted_as_lost_when_the_disk_refuses(
         assert health.counters["lost_disk_full"] == sent - kept > 1, how
 
 
+def test_a_disk_that_refuses_the_tare_of_a_frame_is_survived(
+    open_files: Any,
+    make_frame: Frames,
+    make_tare: Callable[..., Tare],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(record_writer, "FLUSH_S", 0.0)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with open_files(lambda _, tare_id: make_tare(tare_id)) as (files, health):
+        (part,) = (tmp_path / "runs").glob("*.part")
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (part.stat().st_size, hard))
+            files.write(sample_of(ELECTRODE_FRAME.encode(make_frame(1, tare_id=5))))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert health.state is ServiceState.DEGRADED
+    assert health.counters["lost_disk_full"] == 2, "the frame and its tare"
+
+
 @pytest.mark.parametrize("size", [0, 1, 7])
 def test_part_without_even_a_head_is_removed(tmp_path: Path, size: int) -> None:
     """A disk that refuses to write leaves one with each attempt."""
@@ -412,6 +462,23 @@ def test_leftovers_are_recovered_but_not_those_of_the_living(
     assert not list(runs.glob("*.part"))
 
 
+def test_a_recovery_that_was_killed_is_done_again_at_the_next_start(
+    sample: Callable[[int], TapSample], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    item = sample(1)
+    writer = RecordWriter(tmp_path / "lab-dead.mcap")
+    writer.write(item.key, item.schema, item.payload, log_time_ns=1, sequence=1)
+    writer.flush()
+    writer.abandon()
+    half = shutil.copy(writer.part, tmp_path / "lab-dead.recovered.mcap.part")
+    for part in (writer.part, half):
+        os.utime(part, (0, 0))
+    (found,) = recover_all(leftovers(tmp_path))
+    assert list(tmp_path.iterdir()) == [found.path]
+    assert found.path.name == "lab-dead.recovered.mcap"
+    assert caplog.text == ""
+
+
 def test_view_that_fails_leaves_the_record_alone(
     open_files: Any,
     sample: Callable[[int], TapSample],
@@ -430,6 +497,35 @@ def test_view_that_fails_leaves_the_record_alone(
     (record,) = (tmp_path / "runs").glob("*.mcap")
     assert [item.sequence for item in read_record(record)] == list(range(1, 21))
     assert health.counters["view_failed"] == 1
+
+
+def test_what_a_view_counts_last_is_not_lost(
+    open_files: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Ending:
+        """Its thread counts once more, and ends, while the counts of all views are gathered."""
+
+        def __init__(self, _: ViewPlan) -> None:
+            self.counts: Counter[str] = Counter()
+
+        def take_counts(self) -> Counter[str]:
+            counts, self.counts = self.counts, Counter()
+            return counts
+
+        def join(self, _: float) -> bool:
+            self.counts["view_no_mesh"] += 1
+            return True
+
+        def finish(self) -> None:
+            pass
+
+        def close(self, _: float) -> None:
+            pass
+
+    monkeypatch.setattr(writer_module, "LiveView", Ending)
+    with open_files(rrd=True) as (_, health):
+        pass
+    assert health.counters["view_no_mesh"] == 1
 
 
 def test_view_stops_at_its_size(make_frame: Frames, tmp_path: Path) -> None:

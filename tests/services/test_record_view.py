@@ -85,6 +85,23 @@ def test_a_record_with_nothing_to_show_is_named(make_frame: Frames, tmp_path: Pa
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_an_invalid_message_is_left_out_and_told(
+    make_frame: Frames, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The recorder keeps such payloads, so that their cause can be found."""
+    path = tmp_path / "lab.mcap"
+    key = sensor_key("lab", "finger", ELECTRODES.name)
+    with RecordWriter(path) as writer:
+        for payload in (
+            ELECTRODES.codec.encode(make_frame(1)),
+            b"\xff\xff",
+            ELECTRODES.codec.encode(make_frame(2)),
+        ):
+            writer.write(key, ELECTRODES.codec.schema, payload, log_time_ns=1)
+    assert review(path).stat().st_size > 0
+    assert "lab.rrd: 1 messages break the contract" in caplog.text
+
+
 def test_a_full_disk_is_told(record: Path, small_disk: Callable[[str], Path]) -> None:
     disk = small_disk("300k")
     with pytest.raises(RecordingError, match=r"view\.rrd: Rerun cannot write") as caught:

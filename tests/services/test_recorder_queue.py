@@ -43,7 +43,13 @@ def test_lost_messages_are_a_trouble_until_no_more_are_lost(
     assert "not recorded" in status.last_error.message
     assert status.counters["overflow"] == 7
     report.refresh()
-    until(lambda: health.state is ServiceState.READY)
+    assert health.settle() is None, "the recorder's own thread says so"
+
+    def ready() -> bool:
+        report._files.tick()
+        return health.state is ServiceState.READY
+
+    until(ready)
     assert health.status().message.startswith("recording to ")
 
 
@@ -55,5 +61,7 @@ def test_the_end_of_a_loss_does_not_hide_a_full_disk(
     report.refresh()
     report._files._pause("the disk is full")
     report.refresh()
+    report._files._checked_s = float("-inf")
+    report._files.tick()
     assert health.settle() is None, "nothing is about to recover"
     assert health.state is ServiceState.DEGRADED

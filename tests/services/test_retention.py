@@ -145,6 +145,32 @@ def test_age_counts_only_after_the_clock_was_steady(
     assert left(tmp_path) == [name_of(2)]
 
 
+def test_a_record_of_today_stays_after_the_clock_was_put_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A host without a clock of its own that was off the network for a while."""
+    clocks = [1000.0, time.time() - 400 * DAY_S]
+    monkeypatch.setattr(Retention, "_read_clocks", staticmethod(lambda: (clocks[0], clocks[1])))
+    record(tmp_path, name_of(1), age_s=3 * DAY_S)
+    kept, _ = keeper(tmp_path, keep_s=2 * DAY_S)
+
+    def later(seconds: float, jump_s: float = 0.0) -> None:
+        clocks[0] += seconds
+        clocks[1] += seconds + jump_s
+        kept.apply()
+
+    kept.apply()
+    record(tmp_path, name_of(2), age_s=400 * DAY_S)
+    later(1.0)
+    later(1.0, jump_s=400 * DAY_S)
+    later(retention.STEADY_S)
+    assert left(tmp_path) == [name_of(2)], "the other one is from before the start"
+    later(1.9 * DAY_S)
+    assert left(tmp_path) == [name_of(2)]
+    later(0.2 * DAY_S)
+    assert left(tmp_path) == []
+
+
 def test_a_recorder_without_retention_marks_nothing_and_removes_nothing(tmp_path: Path) -> None:
     record(tmp_path, name_of(1), age_s=99 * DAY_S)
     kept, _ = keeper(tmp_path)

@@ -8,7 +8,7 @@ import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import zenoh.ext
 from tests.protos.ros_idl import Features, PointStamped, WrenchStamped
 
 from palpate import Client
-from palpate.bus import ForeignSubscriber, Session
+from palpate.bus import ForeignSubscriber, Session, run_router
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError, StreamTimeout
@@ -267,6 +267,34 @@ def test_a_named_sensor_of_which_nothing_comes_is_told_until_it_comes(
             return status(robot).state is ServiceState.READY
 
         until(over)
+
+
+def test_a_router_of_ros_that_is_gone_is_told_until_it_is_back(
+    link: LinkConfig, until: Until, new_port: Callable[[], int]
+) -> None:
+    """Before, everything was ready, and all messages counted as passed on."""
+    endpoint = f"tcp/127.0.0.1:{new_port()}"
+
+    @contextmanager
+    def router_of_ros() -> Iterator[None]:
+        stop = threading.Event()
+        thread = threading.Thread(target=run_router, args=((endpoint,), stop), daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join(20.0)
+
+    with ExitStack() as first:
+        first.enter_context(router_of_ros())
+        with bridge(link, until, connect=endpoint), Client(link.connect[0]) as robot:
+            until(lambda: status(robot).state is ServiceState.READY)
+            first.close()
+            until(lambda: status(robot).state is ServiceState.DEGRADED)
+            assert f"router of ROS, {endpoint}, is gone" in status(robot).message
+            with router_of_ros():
+                until(lambda: status(robot).state is ServiceState.READY)
 
 
 def test_a_station_that_sends_nothing_yet_is_no_trouble(

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from palpate.config import parse_config
 from palpate.errors import BundleError, ConfigError, ErrorCode, PalpateError, RemoteError
 from palpate.files.bundle import Bundle, read_bundle
 from palpate.messages import ModelAction, ModelCommand, ModelInventory
@@ -229,6 +230,35 @@ def test_caps(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     error = refused(started, LOAD, "x:3")
     assert error.code is ErrorCode.RESOURCE_EXHAUSTED
     assert of(started) == "x:1"
+
+
+def test_room_that_others_only_keep_for_a_roll_back_is_given(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the error says: unload some. It freed nothing."""
+    monkeypatch.setattr(served, "LOADED_MOST", 2)
+    started = service()
+    do(started, LOAD, "x:2", "thumb")
+    assert "unload some" in refused(started, LOAD, "x:3", "ring").remedy
+    do(started, UNLOAD, "", "thumb")
+    do(started, LOAD, "x:3", "ring")
+    assert (of(started), of(started, "thumb"), of(started, "ring")) == ("x:1", "x:1", "x:3")
+    assert "2 bundles are loaded" in refused(started, ROLL_BACK, "", "thumb").problem
+    do(started, UNLOAD, "", "ring")
+    do(started, ROLL_BACK, "", "thumb")
+    assert of(started, "thumb") == "x:2", "it is loaded again"
+    do(started, LOAD, "x:1", "thumb")
+    do(started, LOAD, "y", "thumb")  # in place of the one that it kept itself
+    assert of(started, "thumb") == "y:1"
+
+
+def test_a_profile_with_more_bundles_than_can_be_loaded_is_refused() -> None:
+    """The service ended with the advice to unload some, at each start."""
+    bundles = {f"f{number}": f"b:{number}" for number in range(1, 33)}
+    with pytest.raises(ConfigError, match=r"lab: bundles .*33 different ones.* loads 32"):
+        parse_config(FeaturesServiceConfig, {"bundle": "b:33", "bundles": bundles}, where="lab")
+    config = {"bundle": "b:1", "bundles": {**bundles, "more": "b:1"}}
+    assert len(parse_config(FeaturesServiceConfig, config, where="lab").bundles) == 33
 
 
 def test_a_restart_serves_what_was_served(service: Service, models: Path) -> None:

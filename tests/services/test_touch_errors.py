@@ -14,6 +14,7 @@ import pytest
 
 from palpate.bus.topics import TOPICS, sensor_key
 from palpate.errors import DatasetError, RecordingError
+from palpate.files.record import read_record
 from palpate.files.record_writer import RecordWriter
 from palpate.messages import (
     ElectrodeFrame,
@@ -176,6 +177,27 @@ def test_the_touch_with_the_median_error_is_shown_with_its_fields(
     assert touch.truth is not None
     np.testing.assert_allclose(touch.truth, bundles.pressed(3e-4), atol=1e-9)
     assert typical_touch(record, touches, MeshLibrary()) is None  # nobody knows this mesh
+
+
+def test_invalid_messages_are_left_out_and_told(
+    stamp: Stamp, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    from palpate_services.inference.repository import MeshLibrary
+    from palpate_services.viewer.touch_picture import typical_touch
+
+    whole = record_of(tmp_path / "a.mcap", stamp, [Press(1.0, 0.1)] * 4)
+    damaged = tmp_path / "b.mcap"
+    with RecordWriter(damaged) as writer:
+        for name in ("wrench", "pose", "features", "field", "field_truth"):
+            key = sensor_key("lab", "finger", name)
+            writer.write(key, TOPICS[name].codec.schema, b"\xff\xff", log_time_ns=1)
+        for item in read_record(whole):
+            writer.write(item.key, item.schema, item.payload, log_time_ns=item.log_time_ns)
+    mine = str(bundles.write(tmp_path / "mine", "field"))
+    touches = read_touches(damaged)
+    assert touches.errors() == read_touches(whole).errors()
+    assert "b.mcap: 4 messages break the contract" in caplog.text, "all but the true field"
+    assert typical_touch(damaged, touches, MeshLibrary([mine])) is not None
 
 
 @pytest.mark.parametrize("fields", [True, False])

@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -369,7 +369,7 @@ class Subscriber(Generic[M], Closing):
         check_process()  # also before the locks: one that was held at a fork is never released
         taken: list[ReceivedMessage[M]] = []
         arrival: Arrival | None = None
-        with self._reading:
+        with self._one_reads():
             until_s = time.monotonic() + timeout_s
             while True:
                 with self._lock:
@@ -391,6 +391,16 @@ class Subscriber(Generic[M], Closing):
                 arrival = self._arrivals.wait(ready_s - now_s)
                 if arrival is None:
                     self._get_ready()
+
+    @contextlib.contextmanager
+    def _one_reads(self) -> Iterator[None]:
+        """One thread at a time."""
+        with self._reading:
+            try:
+                yield
+            finally:
+                # Also after an exception while it waited, e.g. Ctrl-C: nobody waits any more.
+                self._waits = False
 
     def _get_ready(self) -> None:
         """Rehearse the next message with the last one."""

@@ -1,7 +1,8 @@
 """The client for asyncio: the same calls with ``await``, streams with ``async for``.
 
 Built on ``Client``: each call runs in a thread of a pool, each stream in one of its own, so that
-nothing blocks the event loop. Cancelling a task cancels its question at the service's side, too.
+nothing blocks the event loop. Cancelling a task cancels its question at the service's side, too,
+and stops its simulation.
 """
 
 from __future__ import annotations
@@ -19,11 +20,9 @@ from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar
 from palpate.bus import Cancellation
 from palpate.bus.zenoh_session import check_process, is_inherited
 from palpate.client.robot import Client
-from palpate.client.simulations import OnProgress, OnStep
 from palpate.client.streams import Stream, Watch
 from palpate.config import TlsConfig
 from palpate.errors import LinkError, PalpateError, SensorChanged
-from palpate.messages import SimulationReply, SimulationRequest
 
 M = TypeVar("M")
 P = ParamSpec("P")
@@ -147,6 +146,10 @@ def _awaitable(
     @functools.wraps(method)
     async def call(client: AsyncClient, /, *args: P.args, **options: P.kwargs) -> R:
         sync = client.sync
+        loop = asyncio.get_running_loop()
+        for name, option in options.items():
+            if name.startswith("on_") and callable(option):
+                options[name] = functools.partial(loop.call_soon_threadsafe, option)
         return await client.in_thread(lambda: method(sync, *args, **options))
 
     return call
@@ -178,7 +181,8 @@ class AsyncClient:
             async for estimate in robot.stream_features("finger"):
                 print(estimate.force)
 
-    Arguments are those of ``Client``; the bus is joined by ``async with``.
+    Arguments are those of ``Client``; the bus is joined by ``async with``. Functions that a method
+    takes (``on_step``, ``on_progress``, ``on_timings``) are called in the event loop.
     """
 
     def __init__(
@@ -195,6 +199,8 @@ class AsyncClient:
         self._client: Client | None = None
         self._streams: list[AsyncStream[Any]] = []
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="palpate call")
+        # Of its own: calls to be cancelled may have all of the others.
+        self._canceller = ThreadPoolExecutor(1, thread_name_prefix="palpate cancel")
 
     features = _awaitable(Client.features)
     electrodes = _awaitable(Client.electrodes)
@@ -209,6 +215,7 @@ class AsyncClient:
     tare = _awaitable(Client.tare)
     zero = _awaitable(Client.zero)
     cancel_simulation = _awaitable(Client.cancel_simulation)
+    simulate = _awaitable(Client.simulate)
     robot_pose_publisher = _awaitable(Client.robot_pose_publisher)
     model = _awaitable(Client.model)
     alive = _awaitable(Client.alive)
@@ -220,41 +227,6 @@ class AsyncClient:
     stream_field = _streaming(Client.stream_field)
     stream_synthesis = _streaming(Client.stream_synthesis)
     stream_wrench = _streaming(Client.stream_wrench)
-
-    async def simulate(
-        self,
-        request: SimulationRequest,
-        *,
-        sensor: str = "twin",
-        timeout_s: float = 60.0,
-        on_progress: OnProgress | None = None,
-        on_step: OnStep | None = None,
-    ) -> SimulationReply:
-        """As ``Client.simulate``; cancelling the task stops the simulation.
-
-        The functions are called in the event loop.
-        """
-        loop = asyncio.get_running_loop()
-
-        def in_loop(function: Callable[P, None] | None) -> Callable[P, None] | None:
-            if function is None:
-                return None
-
-            def call(*args: P.args, **options: P.kwargs) -> None:
-                loop.call_soon_threadsafe(functools.partial(function, *args, **options))
-
-            return call
-
-        sync = self.sync
-        return await self.in_thread(
-            lambda: sync.simulate(
-                request,
-                sensor=sensor,
-                timeout_s=timeout_s,
-                on_progress=in_loop(on_progress),
-                on_step=in_loop(on_step),
-            )
-        )
 
     @property
     def sync(self) -> Client:
@@ -282,7 +254,7 @@ class AsyncClient:
         try:
             return await future
         except asyncio.CancelledError:
-            self._threads.submit(cancellation.cancel)
+            self._canceller.submit(cancellation.cancel)
             raise
 
     def keep(self, stream: AsyncStream[Any]) -> None:
@@ -299,7 +271,11 @@ class AsyncClient:
         client, self._client = self._client, None
         if client is not None:
             await self.in_thread(client.close)
-        self._threads.shutdown(wait=False)
+        self._end_threads()
+
+    def _end_threads(self) -> None:
+        for threads in (self._threads, self._canceller):
+            threads.shutdown(wait=False)
 
     async def __aenter__(self) -> Self:
         opening = self._threads.submit(self._open)
@@ -310,7 +286,7 @@ class AsyncClient:
             raise
         finally:
             if self._client is None:
-                self._threads.shutdown(wait=False)
+                self._end_threads()
         return self
 
     async def __aexit__(

@@ -247,8 +247,16 @@ def write_bundle(
         folder.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         for name, data in (*files.items(), (MANIFEST, text)):
-            (temporary / name).write_bytes(data)
+            with open(temporary / name, "xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())  # what is renamed must outlast a power failure
         temporary.chmod(0o755)
+        handle = os.open(temporary, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
         os.rename(temporary, folder)
     except OSError as error:
         raise BundleError(f"cannot write {folder}: {error}", remedy="check the disk") from error

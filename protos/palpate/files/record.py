@@ -440,6 +440,9 @@ def recover(part: Path) -> Recovery:
         raise RecordingError(
             f"{part} holds no whole message", remedy="there is nothing to recover; delete it"
         )
+    killed = target.with_name(f"{target.name}.part")  # an earlier recovery: its source is all there
+    if killed.exists() and not is_being_written(killed):
+        killed.unlink()
     with RecordWriter(target, facts) as writer:
         for item in itertools.chain((first,), items):
             writer.write(

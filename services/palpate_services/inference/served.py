@@ -2,8 +2,8 @@
 
 A service has one bundle for all sensors, and may have others for single ones. A change is prepared
 beside the serving bundles (read, digests, trial, golden vectors, warm-up) and takes effect by
-replacing one reference between two frames; the bundle from before stays loaded for a roll back
-(docs/adr/0020-models.md).
+replacing one reference between two frames; the bundle from before stays loaded for a roll back,
+until another one needs its room (docs/adr/0020-models.md).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
 from palpate.admin import CommandGuard
@@ -29,7 +29,7 @@ from palpate.messages import (
     ServedModel,
     ServiceState,
 )
-from palpate_services.config import EstimatingConfig
+from palpate_services.config import LOADED_MOST, EstimatingConfig
 from palpate_services.inference.model import Runtime, load
 from palpate_services.inference.remembered import Remembered, RememberedFile
 from palpate_services.inference.repository import Repository
@@ -39,9 +39,6 @@ _log = logging.getLogger(__name__)
 
 SENSORS_MOST = 256
 """Sensors with a bundle of their own."""
-
-LOADED_MOST = 32
-"""Different bundles in memory, with those kept for a roll back."""
 
 DEFAULT = ""
 """Stands for all sensors without a bundle of their own."""
@@ -54,12 +51,13 @@ class Choice:
     Attributes:
         source: Finds it in the repository: ``name:version``, or a path.
         sha256: Its digest, 32 bytes.
-        runtime: Itself; None = not loaded since this process began, or no longer to be had.
+        runtime: Itself; None = not loaded since this process began, no longer to be had, or its
+            room was needed.
     """
 
     source: str
     sha256: bytes
-    runtime: Runtime | None
+    runtime: Runtime | None = field(compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,7 +271,7 @@ class ServedModels:
         sensor = command.sensor
         with self._changing:
             assigned = self._serving.assigned
-            if assigned.get(sensor, _NOTHING) is not before:
+            if assigned.get(sensor, _NOTHING) != before:
                 raise RemoteError(
                     "another command has changed meanwhile what serves",
                     remedy="look with palpate model served, then give the command again",
@@ -341,10 +339,11 @@ class ServedModels:
         """
         folder = self._repository.resolve(source)
         bundle = self._repository.read(folder)
-        loaded = self._loaded()
-        runtime = loaded.get(bundle.sha256)
+        runtime = self._loaded().get(bundle.sha256)
         if runtime is None:
-            if len(loaded) >= LOADED_MOST:
+            if len(self._loaded()) >= LOADED_MOST:
+                self._forget_previous()
+            if len(self._loaded()) >= LOADED_MOST:
                 _refuse_more(f"{LOADED_MOST} bundles are loaded")
             if bundle.sha256 != tried:
                 bundle = proven(bundle, self._task)
@@ -365,6 +364,15 @@ class ServedModels:
                 remedy="bundles never change: restore it, or load another version",
             )
         return found
+
+    def _forget_previous(self) -> None:
+        """Give the room of bundles that only wait for a roll back, which loads its own again."""
+        with self._changing:
+            assigned = {
+                sensor: replace(one, previous=one.previous and replace(one.previous, runtime=None))
+                for sensor, one in self._serving.assigned.items()
+            }
+            self._serving = Serving(assigned)
 
     def _loaded(self) -> dict[bytes, Runtime]:
         return {

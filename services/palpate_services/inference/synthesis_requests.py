@@ -8,7 +8,6 @@ contact that has reached its force, end the simulation: its token on the bus van
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 import uuid
 from collections.abc import Generator, Iterator
@@ -231,7 +230,7 @@ class SynthesisRequests:
         deadline_s = min([one for one in limits if one > 0] + [max(left_s, 1.0)])
         return replace(
             asked,
-            deadline_s=deadline_s if math.isfinite(deadline_s) else self._config.simulation_s,
+            deadline_s=deadline_s,
             want_displacement=True,
             want_contact_force=False,
         )

@@ -25,7 +25,7 @@ LIMIT_S = 5.0
 """Time to load, to compare with the golden vectors and to warm up [s]; those that ship need 0.2."""
 
 MEMORY_BYTES = 192 << 20
-"""RememberedFile for the model's values [bytes], in addition to ``_COPIES`` of its files."""
+"""Memory for the model's values [bytes], in addition to ``_COPIES`` of its files."""
 
 _COPIES = 6  # ONNX Runtime holds the file, its parsed form and packed weights at the same time
 _START_S = 30.0

@@ -62,6 +62,10 @@ class Retention:
         self._name = re.compile(f"(?P<stem>{re.escape(station)}{_STAMP}){_ENDING}")
         self._health = health
         self._mine: dict[tuple[str, int], bool] = {}  # by name and inode: files never change
+        # Those closed since the first look, and when (monotonic, s): the wall clock by which their
+        # files were written may have been put right since then.
+        self._closed_s: dict[tuple[str, int], float] = {}
+        self._looked = False
         self._clocks = self._read_clocks()
         self._steady_since_s = self._clocks[0]
 
@@ -109,6 +113,7 @@ class Retention:
 
     def _found(self) -> Iterator[OldRecord]:
         seen: set[tuple[str, int]] = set()
+        steady_s, wall_s = self._read_clocks()
         for path in self._config.out.glob(f"{self._station}-*.mcap*"):
             match = self._name.fullmatch(path.name)
             # A file can be renamed, recovered or removed by others at any time.
@@ -121,13 +126,19 @@ class Retention:
                     continue
                 if key not in self._mine:
                     self._mine[key] = metadata_of(path).get(FACT) == OLDEST_FIRST
+                    if self._looked:
+                        self._closed_s[key] = steady_s
                 seen.add(key)
                 if not self._mine[key]:
                     continue
                 view = path.with_name(f"{match['stem']}.rrd")
                 size = status.st_size + (view.stat().st_size if view.is_file() else 0)
-                yield OldRecord(path, view, size, status.st_mtime)
+                closed_s = self._closed_s.get(key)
+                ended_s = status.st_mtime if closed_s is None else wall_s - (steady_s - closed_s)
+                yield OldRecord(path, view, size, ended_s)
         self._mine = {key: mine for key, mine in self._mine.items() if key in seen}
+        self._closed_s = {key: at_s for key, at_s in self._closed_s.items() if key in seen}
+        self._looked = True
 
     def _remove(self, record: OldRecord, why: str) -> bool:
         try:

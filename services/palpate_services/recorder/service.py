@@ -98,7 +98,7 @@ class QueueReport:
         self._losing = False
 
     def refresh(self) -> None:
-        """Take over the counters of the queue."""
+        """Take over the counters of the queue; in the thread that reports."""
         counters = self._tap.counters
         self._health.set_counts(counters)
         self._health.gauge("queue_messages", float(self._tap.waiting))
@@ -113,7 +113,7 @@ class QueueReport:
             )
         elif self._losing:
             self._losing = False
-            self._files.says_ready()
+            self._files.other_trouble_is_over()
         self._lost = lost
 
 

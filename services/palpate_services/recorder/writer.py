@@ -21,6 +21,7 @@ from palpate.errors import ErrorCode, RecordingError, WireError
 from palpate.files.record import Recovery, is_being_written, recover
 from palpate.files.record_writer import RecordGone, RecordWriter
 from palpate.health import Health
+from palpate.heartbeat import beat
 from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
 from palpate_services.config import RecorderConfig
 from palpate_services.inference.loop import RateLimit
@@ -99,7 +100,7 @@ def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> l
             # A recovery that was itself killed, its source is still there; or a recorder that was
             # killed before its first write was whole.
             if part.name.endswith(f"{RECOVERED}{PART}") or part.stat().st_size < _HEAD_BYTES:
-                part.unlink()
+                part.unlink(missing_ok=True)
             else:
                 done.append(recover(part))
         except (RecordingError, OSError) as error:
@@ -164,6 +165,10 @@ RESUME_MARGIN_BYTES = 1024**2
 """Recording resumes only with this much more than ``min_free_bytes``: without the margin it would
 start and stop in turn."""
 
+CLOSE_S = 60.0
+"""How long a slow disk may take to close a record, in the thread that beats [s]: it waits until all
+is on the disk."""
+
 VIEW_CLOSE_S = 5.0
 """How long a stopping recorder waits for its view to be completed [s]."""
 
@@ -179,7 +184,9 @@ FindTare = Callable[[str, int], Tare | None]
 
 
 class RecordFiles:
-    """Writes samples to the present record, and draws them into its view. Use from one thread.
+    """Writes samples to the present record, and draws them into its view.
+
+    Use from one thread, but for ``other_trouble_is_over``.
 
     Frames name their tare. One that was taken before the record began is looked up and recorded,
     too: without it nobody could read the frames.
@@ -217,6 +224,7 @@ class RecordFiles:
         self._checked_s = 0.0
         self._tried_s = float("-inf")
         self._told = False  # of the present trouble with the disk
+        self._says_ready = False
         self._recovery = RecordRecovery(config.out, health)
         MeshLibrary(config.bundles)  # raises for one that is missing, which a view would only log
         self._retention = retention.Retention(config, station, health)
@@ -269,6 +277,9 @@ class RecordFiles:
             self._tares.add((sample.sensor, message.tare_id))
         elif isinstance(message, ElectrodeFrame):
             self._write_tare_of(message, sample)
+            if self._writer is None:  # the disk refused the tare
+                self._counts["lost_disk_full"] += 1
+                return
         stream = f"{sample.sensor}/{sample.topic}"
         field_stamp = stamp if topic in _FIELDS else None
         if field_stamp is not None and self._field_rate.reached(stream, field_stamp):
@@ -341,6 +352,9 @@ class RecordFiles:
         if now_s - self._checked_s < CHECK_S:
             return
         self._checked_s = now_s
+        if self._says_ready:
+            self._says_ready = False
+            self._say_ready()
         if self._writer is None:
             self._try_to_resume(now_s)
         else:
@@ -362,10 +376,12 @@ class RecordFiles:
     def report(self) -> None:
         """Hand the counters to health."""
         counts, self._counts = self._counts, Counter()
+        # Views of earlier records stay in the list until their threads have ended, to be counted:
+        # asked before, because a thread may still count between the two.
+        going_on = [v for v in self._views if v is self._view or not v.join(0.0)]
         for view in self._views:
             counts.update(view.take_counts())
-        # Views of earlier records stay in the list until their threads have ended, to be counted.
-        self._views = [v for v in self._views if v is self._view or not v.join(0.0)]
+        self._views = going_on
         for name, count in counts.items():
             self._health.count(name, count)
         size = 0 if self._writer is None else self._writer.bytes_written
@@ -405,12 +421,15 @@ class RecordFiles:
             self._view = LiveView(plan)
             self._views.append(self._view)
         self._path = path
-        self.says_ready()
+        self._say_ready()
         self._counts["records_opened"] += 1
         _log.info("recording to %s", path)
 
-    def says_ready(self) -> None:
-        """Say that it records, if it does; after a trouble of another kind is over."""
+    def other_trouble_is_over(self) -> None:
+        """Have the next ``tick`` say that it records, if it does; from any thread."""
+        self._says_ready = True
+
+    def _say_ready(self) -> None:
         if self._writer is not None:
             self._health.set_state(ServiceState.READY, f"recording to {self._path}")
 
@@ -499,6 +518,7 @@ class RecordFiles:
         view, self._view = self._view, None
         problem = None
         if writer is not None:
+            beat(CLOSE_S)
             try:
                 writer.close()
             except RecordGone as gone:

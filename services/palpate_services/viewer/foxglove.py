@@ -8,7 +8,6 @@ location, estimated and true. A finger's frame is named as its sensor; all of th
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.writer import CompressionType, Writer
 
-from palpate.bus.topics import SCHEMAS, TOPICS
+from palpate.bus.topics import SCHEMAS
 from palpate.errors import ConfigError
 from palpate.files.atomic import written_whole
 from palpate.files.record import metadata_of, read_record
@@ -34,9 +33,13 @@ from palpate_services.viewer.layout import (
 )
 from palpate_services.viewer.record_view import ARROW_M_PER_N
 from palpate_services.viewer.surfaces import OuterSkin, shades
-from palpate_services.viewer.timeline import FieldRow, SensorTimeline, TimelineRow
-
-_log = logging.getLogger(__name__)
+from palpate_services.viewer.timeline import (
+    FieldRow,
+    SensorTimeline,
+    TimelineRow,
+    message_of,
+    tell_left_out,
+)
 
 ROOT = "station"
 """Frame that all fingers' frames hang on."""
@@ -60,7 +63,9 @@ def export_foxglove(record: Path, out: Path, *, bundles: Sequence[str] = ()) -> 
         bundles: Bundles with meshes of its fields, beside the packaged ones.
 
     Returns:
-        Messages of each topic of the scene, and ``view_no_mesh``: fields whose mesh no bundle has.
+        Messages of each topic of the scene; ``view_no_mesh``, fields whose mesh no bundle has;
+        ``view_wrong_mesh``, fields with other nodes than their mesh; ``view_rejected``, messages
+        that break the contract, which are copied and not drawn.
 
     Raises:
         ConfigError: ``out`` is a record, or one of ``bundles`` does not exist.
@@ -88,12 +93,11 @@ def export_foxglove(record: Path, out: Path, *, bundles: Sequence[str] = ()) -> 
                 sequence=item.sequence,
             )
             if item.address.topic in SensorTimeline.TOPICS:
-                message = TOPICS[item.address.topic].codec.decode(item.payload)
-                scenes.add(item.address.sensor, message, item.log_time_ns)
+                message = message_of(item, scenes.counts)
+                if message is not None:
+                    scenes.add(item.address.sensor, message, item.log_time_ns)
         writer.finish()
-    for name, count in scenes.counts.items():
-        if name == "view_no_mesh":
-            _log.warning("%s: %d fields are not shown, as no bundle has their mesh", out, count)
+    tell_left_out(out, scenes.counts)
     return scenes.counts
 
 
@@ -154,13 +158,13 @@ class _Scenes:
                 self._field(sensor, name, field)
 
     def _field(self, sensor: str, name: str, field: FieldRow) -> None:
-        skin = self._skins.get(field.mesh_sha256)
+        mesh = self._meshes.find(field.mesh_sha256)
+        if mesh is None or field.displacement.shape != mesh.nodes.shape:
+            self.counts["view_no_mesh" if mesh is None else "view_wrong_mesh"] += 1
+            return
+        skin = self._skins.get(mesh.sha256)
         if skin is None:
-            mesh = self._meshes.find(field.mesh_sha256)
-            if mesh is None or field.displacement.shape != mesh.nodes.shape:
-                self.counts["view_no_mesh"] += 1
-                return
-            skin = self._skins[field.mesh_sha256] = OuterSkin(mesh)
+            skin = self._skins[mesh.sha256] = OuterSkin(mesh)
         entity = _entity(sensor, f"skin/{name}", field.time_ns)
         moved = field.displacement[skin.used]
         triangles = entity.triangles.add()

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from palpate.bus.topics import TOPICS
 from palpate.errors import RecordingError
 from palpate.files.atomic import written_whole
 from palpate.files.bundle import FieldMesh
@@ -38,7 +37,13 @@ from palpate_services.viewer.layout import (
     record_layout,
 )
 from palpate_services.viewer.surfaces import OuterSkin, normals_of, shades
-from palpate_services.viewer.timeline import FieldRow, SensorTimeline, TimelineRow
+from palpate_services.viewer.timeline import (
+    FieldRow,
+    SensorTimeline,
+    TimelineRow,
+    message_of,
+    tell_left_out,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -375,7 +380,7 @@ def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = (
     """Make the view of an existing record, by default beside it with the ending ``.rrd``.
 
     It is written whole or not at all; one that is there is replaced. ``bundles`` hold meshes of its
-    fields, beside the packaged ones. Returns the view's path.
+    fields, beside the packaged ones. What is left out is told in the log. Returns the view's path.
 
     Raises:
         ConfigError: One of ``bundles`` does not exist.
@@ -390,9 +395,10 @@ def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = (
         RerunView(part, title=record.stem, meshes=meshes, named=target) as drawn,
     ):
         for count, item in enumerate(read_record(record), start=1):
-            topic = item.address.topic
-            if topic in SensorTimeline.TOPICS:
-                drawn.add(item.address.sensor, TOPICS[topic].codec.decode(item.payload))
+            if item.address.topic in SensorTimeline.TOPICS:
+                message = message_of(item, drawn.counters)
+                if message is not None:
+                    drawn.add(item.address.sensor, message)
             if count % (BATCH_MESSAGES * len(SensorTimeline.TOPICS)) == 0:
                 drawn.flush()
         drawn.close()
@@ -401,7 +407,5 @@ def review(record: Path, view: Path | None = None, *, bundles: Sequence[str] = (
                 f"{record} holds nothing that a view shows",
                 remedy="give a record with frames or estimates: palpate info",
             )
-    for name, count in drawn.counters.items():
-        if count:
-            _log.warning("%s: %s %d", target, name, count)
+    tell_left_out(target, drawn.counters)
     return target

@@ -5,14 +5,19 @@ Free of any drawing library, so that ``record_view`` and ``plot`` remain thin.
 
 from __future__ import annotations
 
-from collections import OrderedDict, defaultdict
+import logging
+from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from palpate.bus.topics import TOPICS
+from palpate.errors import WireError
+from palpate.files.record import RecordItem
 from palpate.messages import (
     NO_TARE,
     ElectrodeFrame,
@@ -28,6 +33,34 @@ from palpate.messages import (
     WrenchFrame,
     as_field_frame,
 )
+
+_log = logging.getLogger(__name__)
+
+_LEFT_OUT = {
+    "view_no_mesh": "fields are not shown, as no bundle has their mesh",
+    "view_wrong_mesh": "fields are not shown, as they have other nodes than their mesh",
+    "view_rejected": "messages break the contract and are left out",
+}
+
+
+def message_of(item: RecordItem, counts: Counter[str]) -> Any:
+    """The message of a record's item; None if it breaks the contract: counted, ``view_rejected``.
+
+    The recorder keeps such payloads, so that their cause can be found.
+    """
+    try:
+        return TOPICS[item.address.topic].codec.decode(item.payload)
+    except WireError:
+        counts["view_rejected"] += 1
+        return None
+
+
+def tell_left_out(path: Path, counts: Mapping[str, int]) -> None:
+    """Say in the log what a view or a table does not show, and why."""
+    for name, why in _LEFT_OUT.items():
+        if counts.get(name):
+            _log.warning("%s: %d %s", path, counts[name], why)
+
 
 DRAW_PERIOD_NS = 200_000_000
 """At most five fields a second are drawn, by their stamps: each costs 16 bytes a vertex."""

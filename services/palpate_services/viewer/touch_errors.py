@@ -6,6 +6,7 @@ So errors are counted by the true force, and those of touched frames come first.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,11 +15,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from palpate.bus.topics import TOPICS
 from palpate.errors import RecordingError
 from palpate.files.record import read_record
 from palpate.messages import FeatureEstimate, FieldEstimate, IndenterPoseFrame, WrenchFrame
-from palpate_services.viewer.timeline import MatchedMessages, TruthMatcher
+from palpate_services.viewer.timeline import (
+    MatchedMessages,
+    TruthMatcher,
+    message_of,
+    tell_left_out,
+)
 
 TOUCHED_N = 0.5
 """A finger counts as touched from this true force on [N]: less than a robot grips anything with."""
@@ -171,17 +176,22 @@ def _middle_and_tail(errors: list[float]) -> tuple[float | None, float | None]:
 def read_touches(record: Path, *, sensor: str | None = None) -> RecordedTouches:
     """Estimates and truth of one sensor of a record, by default that with the most estimates.
 
+    Messages that break the contract are left out, which the log tells.
+
     Raises:
         RecordingError: The record is damaged or holds no estimates.
     """
     matchers: dict[str, TruthMatcher] = {}
     estimates: dict[str, int] = {}
     fields: dict[str, set[int]] = {}
+    counts: Counter[str] = Counter()
     for item in read_record(record):
         topic, whose = item.address.topic, item.address.sensor
         if topic not in (*_MATCHED, "field") or sensor not in (None, whose):
             continue
-        message = TOPICS[topic].codec.decode(item.payload)
+        message = message_of(item, counts)
+        if message is None:
+            continue
         if isinstance(message, FieldEstimate):
             fields.setdefault(whose, set()).add(message.source.monotonic_ns)
             continue
@@ -189,6 +199,7 @@ def read_touches(record: Path, *, sensor: str | None = None) -> RecordedTouches:
         matchers.setdefault(whose, TruthMatcher(remember=None)).add(message)
         if isinstance(message, FeatureEstimate):
             estimates[whose] = estimates.get(whose, 0) + 1
+    tell_left_out(record, counts)
     if not estimates:
         of_whom = "" if sensor is None else f" of the sensor {sensor!r}"
         raise RecordingError(

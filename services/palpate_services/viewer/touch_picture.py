@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,14 +11,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from palpate.bus.topics import TOPICS
 from palpate.files.bundle import FieldMesh
 from palpate.files.record import read_record
 from palpate.messages import FieldEstimate, FieldFrame, FloatArray, WrenchFrame
 from palpate.process import require
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.viewer.surfaces import normals_of, shades
-from palpate_services.viewer.timeline import MatchedMessages, line_of_action
+from palpate_services.viewer.timeline import MatchedMessages, line_of_action, message_of
 from palpate_services.viewer.touch_errors import TOUCHED_N, RecordedTouches
 
 INK = "#30343b"
@@ -90,7 +90,7 @@ def _with_fields(
     for item in read_record(record):
         if item.address.sensor != sensor or item.address.topic not in ("field", "field_truth"):
             continue
-        message = TOPICS[item.address.topic].codec.decode(item.payload)
+        message = message_of(item, Counter())  # `read_touches` has told what is left out
         if isinstance(message, FieldEstimate):
             if message.source.monotonic_ns == time_ns:
                 estimate = message
