@@ -11,6 +11,7 @@ from pathlib import Path
 
 from palpate.errors import ConfigError
 from palpate_fem.config import FingertipParameters
+from palpate_fem.indenter.catalogue import indenter_names
 from palpate_fem.mesh.solid import check_limits
 from palpate_fem.service.batch import SimulationBatch, TrajectoryBatch
 from palpate_fem.service.config import DEFAULT_FACTORY
@@ -48,6 +49,7 @@ class FingertipModel:
         devices: Sequence[str] = (),
         slots: int | None = None,
         ray: str | None = None,
+        indenters: tuple[str, ...] = indenter_names(),
     ) -> tuple[Callable[[], AbstractContextManager[TrajectoryBatch]], int]:
         """What starts the processes that run trajectories, and how many make files of them.
 
@@ -59,15 +61,16 @@ class FingertipModel:
             devices: Warp devices that solve many trajectories at once; none = the CPU.
             slots: Trajectories at once on each device; None = the usual number.
             ray: Address of a cluster on which they run; ``devices`` are then its.
+            indenters: Names of all that trajectories may have, for devices.
         """
         setup = self.setup()
         if ray is not None:
             device = devices[0] if devices else None
             make = partial(ray_batch, ray, setup, device=device, slots=slots or SLOTS)
-            return partial(make, limit_s=limit_s), cluster_packers(workers)
+            return partial(make, limit_s=limit_s, indenters=indenters), cluster_packers(workers)
         if devices:
             threads, packers = threads_and_packers(devices, workers)
-            batch = partial(DeviceBatch, setup, devices, slots=slots or SLOTS)
+            batch = partial(DeviceBatch, setup, devices, slots=slots or SLOTS, indenters=indenters)
             return partial(batch, threads=threads, limit_s=limit_s), packers
         count, threads = workers_for(workers, jobs)
         return partial(SimulationBatch, setup, workers=count, threads=threads, limit_s=limit_s), 0

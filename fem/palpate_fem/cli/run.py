@@ -190,15 +190,18 @@ class RunOptions:
             return self.devices
         return (f"the {'GPUs' if 'cuda' in self.devices else 'CPUs'} of the Ray cluster",)
 
+    @property
+    def swept(self) -> tuple[str, ...]:
+        """The indenters of a sweep, each once, as one may have several names."""
+        named = dict.fromkeys(make_indenter(name).name for name in self.indenters)
+        return tuple(named) or indenter_names()
+
     def plans(self, fingertip: StoredFingertip) -> Sequence[TrajectoryPlan]:
         """The trajectories to run on a fingertip."""
         skin = skin_of(fingertip)
         if self.sweep:
-            # An indenter has several names.
-            named = dict.fromkeys(make_indenter(name).name for name in self.indenters)
-            names = tuple(named) or indenter_names()
             return points_first(
-                Campaign(skin, names, self.points, self.seed, self.steps, angled=self.angled)
+                Campaign(skin, self.swept, self.points, self.seed, self.steps, angled=self.angled)
             )
         indenter = make_indenter((self.indenters or (DEFAULT_INDENTER,))[0])
         if self.poses is not None:
@@ -241,6 +244,7 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
         devices=options.devices,
         slots=options.slots,
         ray=options.ray,
+        indenters=options.swept,
     )
     done: list[IndentationResult] = []
     held: list[TrajectorySummary] = []

@@ -44,8 +44,9 @@ class FemConfig(StrictConfig):
         max_steps: Most steps of a request.
         max_deadline_s: Longest time for a request, waiting included [s].
         grace_s: Time after its deadline at which a solver that still runs is killed [s].
-        device: Device that solves many requests at once, e.g. ``cuda:0``, if their parameters are
-            those of ``fingertip``; ``auto`` = the first GPU if there is one; None = workers alone.
+        device: Device that solves many requests at once, e.g. ``cuda:0``, if their indenter is one
+            of the nine and their parameters are those of ``fingertip``; ``auto`` = the first GPU if
+            there is one; None = workers alone.
         slots: Requests at once on it; as many as ``waiting`` more may wait for it.
         keep: Number of pressurised fingertips that each worker keeps.
         fingertip: Default parameters of requests.

@@ -25,7 +25,7 @@ from palpate.heartbeat import Turns
 from palpate.process import Closing
 from palpate.rigid import path_lengths
 from palpate_fem.arrays import Floats
-from palpate_fem.indenter.catalogue import indenter_names
+from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.result import IndentationOutcome, IndentationStep
 from palpate_fem.service.device_process import HANG_S, START_S, DeviceProcess
 from palpate_fem.service.jobs import (
@@ -110,11 +110,11 @@ class DeviceTask:
 class DevicePool(Closing):
     """Runs jobs on a device, and with workers; used like a `WorkerPool`.
 
-    Jobs whose parameters are those of the warm fingertip go to the device while it is ready, all
-    others to the workers. Its process is started again whenever it has ended, and gets what still
-    waits for a worker then. All events of a device are handled by one thread; workers' threads come
-    in with those of jobs that are redone. Shared state is changed under one lock, and callbacks to
-    owners run outside of it.
+    Jobs whose parameters are those of the warm fingertip and whose indenter is one of the nine go
+    to the device while it is ready, all others to the workers. Its process is started again
+    whenever it has ended, and gets what still waits for a worker then. All events of a device are
+    handled by one thread; workers' threads come in with those of jobs that are redone. Shared state
+    is changed under one lock, and callbacks to owners run outside of it.
 
     Args:
         setup: How the fingertip is made; what makes it is a ``SlottedTip``.
@@ -219,12 +219,12 @@ class DevicePool(Closing):
 
     def submit(self, job: SimulationJob, on_event: OnEvent) -> None:
         """Run a job; see ``WorkerPool.submit``."""
+        ours = self._is_ours(job)
         with self._lock:
             if self._closing.is_set():
                 raise pool_stopping()
-            process = self._ready_process()
-            ours = process is not None and job.parameters == self._setup.worker.warm
-            if process is not None and ours:
+            process = self._ready_process() if ours else None
+            if process is not None:
                 free, slots = self._setup.slots - len(process.open), self._setup.slots
                 waiting = len(self._waiting)
                 if waiting >= self._capacity + free:
@@ -233,7 +233,7 @@ class DevicePool(Closing):
                 task = DeviceTask(job, on_event, time.monotonic() + job.deadline_s)
                 self._tasks[job.id] = task
                 self._waiting.append(task)
-        if ours:
+        if process is not None:
             self._events.put(None)  # its thread looks at what waits
         else:
             self._cpu.submit(job, on_event)
@@ -276,6 +276,11 @@ class DevicePool(Closing):
     def _ready_process(self) -> DeviceProcess[DeviceTask] | None:
         process = self._process
         return process if process is not None and process.ready and not process.hung else None
+
+    def _is_ours(self, job: SimulationJob) -> bool:
+        """Whether the device can solve a job."""
+        there = make_indenter(job.indenter).name in self._setup.indenters
+        return there and job.parameters == self._setup.worker.warm
 
     def _serve(self) -> None:
         while not self._closing.is_set():
@@ -419,11 +424,10 @@ class DevicePool(Closing):
 
     def _take_back(self) -> None:
         """Give the device what still waits for a worker."""
-        warm = self._setup.worker.warm
 
         def is_mine(job: SimulationJob) -> bool:
             known = self._tasks.get(job.id)
-            return job.parameters == warm and not (known and known.workers_only)
+            return self._is_ours(job) and not (known and known.workers_only)
 
         with self._lock:
             for one in self._cpu.take_back(is_mine):
