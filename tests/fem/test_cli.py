@@ -325,6 +325,7 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
         (("--store", f"{__file__}/a.sim"), "no folder"),
         (("--edge-mm", 0), "edge_m"),
         (("--edge-mm", 50), "edge_m"),
+        (("--edge-mm", 1.2345), "whole micrometres"),
         (("--layers", 50), "layers"),
         (("--sweep", "--store", "a.sim", "--depth-mm", 1), "--depth-mm has no effect"),
         (("--path", "press 1 mm", "--steps", 3), "--steps has no effect with --path"),
