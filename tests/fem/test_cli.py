@@ -33,6 +33,8 @@ from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import COLUMNS
 from palpate_fem.result import IndentationOutcome
+from palpate_fem.service import node
+from palpate_fem.service.config import FemConfig
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter
 from palpate_fem.study import PathRow
@@ -563,6 +565,19 @@ def test_each_serve_answers_for_its_own_sensor(link: LinkConfig) -> None:
         for process in processes:
             process.kill()
             process.wait()
+
+
+def test_serve_starts_with_its_defaults_on_a_host_of_any_size(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 400)
+    served: list[FemConfig] = []
+    monkeypatch.setattr(node, "run", lambda config, *_, **__: served.append(config))
+    assert fem("serve").exit_code == 0
+    assert fem("serve", "--workers", 1).exit_code == 0
+    assert [(one.workers, one.threads_each()) for one in served] == [(64, 6), (1, 400)]
+    with pytest.raises(ConfigError, match="workers"):
+        fem("serve", "--workers", 65)
 
 
 def test_serve_without_a_router(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -357,18 +357,17 @@ def serve_command(
     """
     # Only this command needs the bus.
     from palpate_fem.service import node
-    from palpate_fem.service.config import FemConfig
+    from palpate_fem.service.config import WORKERS_MOST, FemConfig
 
     if slots is not None and device is None:
         raise ConfigError("--slots without --device", remedy=_NAME_THE_DEVICE)
     device = wanted_device(device)
-    count, threads = workers_for(workers)
+    count = workers or min(workers_for(0)[0], WORKERS_MOST)
     config = parse_config(
         FemConfig,
         {
             "sensor": sensor,
             "workers": count,
-            "threads": threads,
             "device": device,
             **({} if slots is None else {"slots": slots}),
             "waiting": waiting,

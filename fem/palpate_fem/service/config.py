@@ -12,6 +12,9 @@ from palpate_fem.config import FingertipParameters
 
 DEFAULT_FACTORY = "palpate_fem.service.biotac:biotac"
 
+WORKERS_MOST = 64
+"""Solver processes of a service."""
+
 
 class FingertipTable(StrictConfig):
     """Default parameters of requests; None = the paper's, see ``FingertipParameters``."""
@@ -55,7 +58,7 @@ class FemConfig(StrictConfig):
     """
 
     sensor: Name = "twin"
-    workers: int = Field(default=2, ge=1, le=64)
+    workers: int = Field(default=2, ge=1, le=WORKERS_MOST)
     threads: int = Field(default=0, ge=0, le=256)
     waiting: int = Field(default=8, ge=0, le=1000)
     max_steps: int = Field(default=200, ge=1, lt=10_000)
