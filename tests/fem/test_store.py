@@ -234,8 +234,23 @@ def test_export_is_the_same_store(
     with pytest.raises(DatasetError, match="one file already"):
         export(store, path.with_name("again.h5"))
     with pytest.raises(DatasetError, match="no 'cube'"):
-        export(SimulationStore.open(path), single, ids=["cube"])
-    assert SimulationStore.open(single).check() == 2, "a failed export leaves the file as it was"
+        export(SimulationStore.open(path), path.with_name("again.h5"), ids=["cube"])
+    assert sorted(path.parent.iterdir()) == sorted([path, single]), "it leaves nothing behind"
+
+
+def test_export_replaces_nothing(path: Path) -> None:
+    """Not even what appears while it copies."""
+    single = path.with_suffix(".h5")
+
+    def write_another(*_: int) -> None:
+        single.write_bytes(b"mine")
+
+    with pytest.raises(ConfigError, match="is there already"):
+        export(SimulationStore.open(path), single, progress=write_another)
+    assert single.read_bytes() == b"mine"
+    assert sorted(path.parent.iterdir()) == sorted([path, single])
+    with pytest.raises(ConfigError, match="is there already"):
+        export(SimulationStore.open(path), single)
 
 
 def test_export_onto_a_full_disk(path: Path) -> None:

@@ -41,7 +41,7 @@ from palpate_fem.service.device_process import check_places, wanted_device
 from palpate_fem.service.fingertips import check_start, skin_of
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.writer import export
+from palpate_fem.store.writer import check_free, export
 from palpate_fem.trajectory import (
     Campaign,
     angled_direction,
@@ -319,8 +319,7 @@ def export_command(store: Path, out: Path) -> None:
         raise ConfigError(
             f"{out} does not end in {EXPORT_SUFFIX}", remedy=f"call it {out.stem}{EXPORT_SUFFIX}"
         )
-    if out.exists():
-        raise ConfigError(f"{out} is there already", remedy="name another file, or remove it")
+    check_free(out)  # before the store is checked, which takes long
     opened = SimulationStore.open(store)
     with progress_bar() as bar:
         task = bar.add_task("check", total=None)
