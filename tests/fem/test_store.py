@@ -172,6 +172,10 @@ def test_failed_simulation_leaves_no_trace(path: Path, tip: StoredFingertip) -> 
         (lambda tip: sample_fingertip(divisions=5), r"mesh sample 5 x 2 \(.*divisions 5 is not 4"),
         (lambda tip: replace(tip, pressurised_nodes=tip.pressurised_nodes + 1e-6), "1.* um away"),
         (lambda tip: replace(tip, pressurised_nodes=tip.pressurised_nodes * np.nan), "nan um away"),
+        (lambda tip: replace(tip, core_vertices=tip.core_vertices * 0.9), "the core is not"),
+        (lambda tip: replace(tip, core_vertices=tip.core_vertices[:-1]), "the core is not"),
+        (lambda tip: replace(tip, core_faces=tip.core_faces[:, [0, 2, 1]]), "the core is not"),
+        (lambda tip: replace(tip, fluid_volume_m3=1.1 * tip.fluid_volume_m3), "fluid volume of"),
     ],
 )  # fmt: skip
 def test_another_fingertip_is_refused(
@@ -185,6 +189,8 @@ def test_another_fingertip_is_refused(
         tip,
         settings={**tip.settings, "divisions": np.int64(4)},  # type: ignore[dict-item]
         pressurised_nodes=tip.pressurised_nodes + 1e-12,
+        core_vertices=tip.core_vertices + 1e-12,
+        fluid_volume_m3=tip.fluid_volume_m3 * (1.0 + 1e-9),
     )
     StoreWriter(path, same).close()
 
