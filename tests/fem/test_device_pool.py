@@ -338,6 +338,36 @@ def test_what_waits_for_a_worker_goes_back_to_the_device(monkeypatch: pytest.Mon
         assert pool.waiting == pool.busy == 0
 
 
+@pytest.mark.parametrize("name", ["1", "away"])
+def test_a_cancel_is_not_lost_while_the_device_takes_jobs_back(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The device had 1 and was killed; the other one came while it was away."""
+    monkeypatch.setattr(device_pool, "PAUSE_S", 0.1)
+    with pool_of(fakes.SLOW, waiting=20, cpu_waiting=20) as pool:
+        await_ready(pool)
+        take_back, cancel = pool._take_back, pool._cpu.cancel
+
+        def cancel_too_late(job_id: str) -> bool:
+            take_back()
+            pool._dispatch()
+            return cancel(job_id)
+
+        monkeypatch.setattr(pool, "_take_back", lambda: None)
+        asked = {one: submit(pool, one, fakes.SLOW, steps=30) for one in ("0", "1")}
+        until(lambda: pool.busy == 2)
+        assert pool.pid is not None
+        os.kill(pool.pid, signal.SIGKILL)
+        until(lambda: pool.restarts == 1)
+        asked["away"] = submit(pool, "away", fakes.SLOW, steps=30)
+        await_ready(pool)
+        monkeypatch.setattr(pool._cpu, "cancel", cancel_too_late)
+        assert pool.cancel(name)
+        end, steps = ended(asked[name])
+        assert isinstance(end, JobEnded)
+        assert (end.outcome, steps < 30) == (IndentationOutcome.CANCELLED, True)
+
+
 def test_workers_solve_what_indenters_the_device_lacks() -> None:
     with pool_of(fakes.QUICK) as pool:
         await_ready(pool)

@@ -240,23 +240,27 @@ class DevicePool(Closing):
 
     def cancel(self, job_id: str) -> bool:
         """Stop a job; see ``WorkerPool.cancel``."""
+        # One that came while the device was away may be taken back between the first two looks.
+        return self._cancel_task(job_id) or self._cpu.cancel(job_id) or self._cancel_task(job_id)
+
+    def _cancel_task(self, job_id: str) -> bool:
+        """Stop a job that the device was to solve; False = there is none of that id."""
         with self._lock:
             task = self._tasks.get(job_id)
-            waited = task is not None and task in self._waiting
-            if task is not None:
-                task.cancelled = True
-                if waited:
-                    self._waiting.remove(task)
-                elif self._process is not None and task.number in self._process.open:
-                    task.overdue = min(task.overdue, time.monotonic() + self._grace_s)
-                    self._process.send(StopPress(task.number))
-                    return True
-        if task is None:
-            return self._cpu.cancel(job_id)
+            if task is None:
+                return False
+            task.cancelled = True
+            waited = task in self._waiting
+            if waited:
+                self._waiting.remove(task)
+            elif self._process is not None and task.number in self._process.open:
+                task.overdue = min(task.overdue, time.monotonic() + self._grace_s)
+                self._process.send(StopPress(task.number))
+                return True
         if waited:
-            self._finish(task, JobEnded(IndentationOutcome.CANCELLED, "cancelled while it waited"))
-        else:
-            self._cpu.cancel(job_id)  # if it is not there yet, it will be seen to be cancelled
+            self._finish(task, self._cancelled_waiting(task))
+        else:  # on its way to or from the workers it is seen to be cancelled
+            self._cpu.cancel(job_id)
         return True
 
     def close(self) -> None:
@@ -347,6 +351,10 @@ class DevicePool(Closing):
         """Give the device what waits while slots are free, and tell the others their place."""
         started: list[DeviceTask] = []
         with self._lock:
+            # Those that were cancelled while they were taken back from the workers.
+            cancelled = [task for task in self._waiting if task.cancelled]
+            for task in cancelled:
+                self._waiting.remove(task)
             process = self._ready_process()
             while process is not None and self._waiting and len(process.open) < self._setup.slots:
                 task = self._waiting.popleft()
@@ -356,6 +364,8 @@ class DevicePool(Closing):
                 process.give(NumberedPress(task.number, job.indenter, job.path, left_s), task)
                 started.append(task)
             waiting = list(self._waiting)
+        for task in cancelled:
+            self._finish(task, self._cancelled_waiting(task))
         for task in started:
             assert self._fingertip is not None
             if not task.started:
@@ -499,6 +509,10 @@ class DevicePool(Closing):
             f"{task.made} their forces are {apart_n:.3f} N apart",
             "ask again with shorter steps, or serve without --device",
         )
+
+    def _cancelled_waiting(self, task: DeviceTask) -> JobEnded:
+        how = "cancelled while it waited"
+        return self._ended(task, JobEnded(IndentationOutcome.CANCELLED, how))
 
     @staticmethod
     def _ended(task: DeviceTask, end: JobEnded) -> JobEnded:
