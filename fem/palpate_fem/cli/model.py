@@ -11,7 +11,6 @@ from pathlib import Path
 
 from palpate.errors import ConfigError
 from palpate_fem.config import FingertipParameters
-from palpate_fem.indenter.catalogue import indenter_names
 from palpate_fem.mesh.solid import check_limits
 from palpate_fem.service.batch import SimulationBatch, TrajectoryBatch
 from palpate_fem.service.config import DEFAULT_FACTORY
@@ -46,10 +45,10 @@ class FingertipModel:
         *,
         jobs: int | None,
         limit_s: float,
+        indenters: tuple[str, ...],
         devices: Sequence[str] = (),
         slots: int | None = None,
         ray: str | None = None,
-        indenters: tuple[str, ...] = indenter_names(),
     ) -> tuple[Callable[[], AbstractContextManager[TrajectoryBatch]], int]:
         """What starts the processes that run trajectories, and how many make files of them.
 
@@ -58,10 +57,10 @@ class FingertipModel:
                 make files.
             jobs: Number of trajectories, if it is known.
             limit_s: Longest time for one [s].
+            indenters: Names of all that trajectories may have.
             devices: Warp devices that solve many trajectories at once; none = the CPU.
             slots: Trajectories at once on each device; None = the usual number.
             ray: Address of a cluster on which they run; ``devices`` are then its.
-            indenters: Names of all that trajectories may have, for devices.
         """
         setup = self.setup()
         if ray is not None:

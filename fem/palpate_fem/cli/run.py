@@ -241,10 +241,10 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
         workers,
         jobs=None if sweep else 1,
         limit_s=options.limit_s,
+        indenters=options.swept,
         devices=options.devices,
         slots=options.slots,
         ray=options.ray,
-        indenters=options.swept,
     )
     done: list[IndentationResult] = []
     held: list[TrajectorySummary] = []

@@ -180,9 +180,9 @@ def check_limits(**arguments: float) -> None:
                 remedy="stay within these limits; lengths are in metres here, in mm as options",
             )
         # The mesh's name holds its edge in whole um: from it a store's mesh is built again.
-        if name == "edge_m" and abs(value * 1e6 - round(value * 1e6)) > 1e-6:
+        nearest_m = round(value * 1e6) / 1e6
+        if name == "edge_m" and abs(value - nearest_m) > 1e-12:
             raise ConfigError(
                 f"edge_m = {value} is not in whole micrometres",
-                remedy=f"give {round(value * 1e6) / 1e6:g}, or as an option "
-                f"{round(value * 1e6) / 1e3:g} mm",
+                remedy=f"give {nearest_m:g}, or as an option {nearest_m * 1e3:g} mm",
             )
