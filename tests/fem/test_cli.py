@@ -33,6 +33,8 @@ from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import COLUMNS
 from palpate_fem.result import IndentationOutcome
+from palpate_fem.service import node
+from palpate_fem.service.config import FemConfig
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter
 from palpate_fem.study import PathRow
@@ -325,6 +327,7 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
         (("--store", f"{__file__}/a.sim"), "no folder"),
         (("--edge-mm", 0), "edge_m"),
         (("--edge-mm", 50), "edge_m"),
+        (("--edge-mm", 1.2345), "whole micrometres"),
         (("--layers", 50), "layers"),
         (("--sweep", "--store", "a.sim", "--depth-mm", 1), "--depth-mm has no effect"),
         (("--path", "press 1 mm", "--steps", 3), "--steps has no effect with --path"),
@@ -562,6 +565,19 @@ def test_each_serve_answers_for_its_own_sensor(link: LinkConfig) -> None:
         for process in processes:
             process.kill()
             process.wait()
+
+
+def test_serve_starts_with_its_defaults_on_a_host_of_any_size(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 400)
+    served: list[FemConfig] = []
+    monkeypatch.setattr(node, "run", lambda config, *_, **__: served.append(config))
+    assert fem("serve").exit_code == 0
+    assert fem("serve", "--workers", 1).exit_code == 0
+    assert [(one.workers, one.threads_each()) for one in served] == [(64, 6), (1, 400)]
+    with pytest.raises(ConfigError, match="workers"):
+        fem("serve", "--workers", 65)
 
 
 def test_serve_without_a_router(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:

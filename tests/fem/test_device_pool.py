@@ -259,7 +259,12 @@ def until(true: Callable[[], Any], patience_s: float = PATIENCE_S) -> None:
 
 
 def submit(
-    pool: DevicePool, name: str, kind: float, steps: int = 4, deadline_s: float = 600.0
+    pool: DevicePool,
+    name: str,
+    kind: float,
+    steps: int = 4,
+    deadline_s: float = 600.0,
+    indenter: str = "sphere_medium",
 ) -> queue.SimpleQueue[JobEvent]:
     """A job's events."""
     path = np.zeros((steps + 1, 7))
@@ -267,7 +272,7 @@ def submit(
     path[:, 2] = np.linspace(-0.009, -0.005, steps + 1)
     events: queue.SimpleQueue[JobEvent] = queue.SimpleQueue()
     parameters = FingertipParameters(friction_coefficient=kind)
-    pool.submit(SimulationJob(name, parameters, "sphere_medium", path, deadline_s), events.put)
+    pool.submit(SimulationJob(name, parameters, indenter, path, deadline_s), events.put)
     return events
 
 
@@ -308,7 +313,7 @@ def test_a_device_that_hangs_is_replaced() -> None:
 
 
 def test_what_waits_for_a_worker_goes_back_to_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its process is killed with two jobs on it; jobs of another finger stay with the worker."""
+    """Its process is killed with two jobs on it; what it cannot solve stays with the worker."""
     monkeypatch.setattr(device_pool, "PAUSE_S", 0.1)
     with pool_of(fakes.SLOW, waiting=20, cpu_waiting=20) as pool:
         await_ready(pool)
@@ -318,15 +323,59 @@ def test_what_waits_for_a_worker_goes_back_to_the_device(monkeypatch: pytest.Mon
         assert pool.pid is not None
         os.kill(pool.pid, signal.SIGKILL)
         until(lambda: pool.restarts == 1)
-        other = submit(pool, "other", fakes.QUICK)
+        others = [
+            submit(pool, "finger", fakes.QUICK),
+            submit(pool, "indenter", fakes.SLOW, indenter="plate"),
+        ]
         away = submit(pool, "away", fakes.SLOW, steps=30)
         for k, events in enumerate([*asked, away]):
             end, steps = ended(events)
             assert isinstance(end, JobEnded), end
             assert (end.outcome, steps + (k == 0)) == (IndentationOutcome.COMPLETE, 30)
-        assert isinstance(ended(other)[0], JobEnded)
+        for events in others:
+            assert isinstance(ended(events)[0], JobEnded)
         assert pool.redone == 1, "one ran on the worker, all others came back"
         assert pool.waiting == pool.busy == 0
+
+
+@pytest.mark.parametrize("name", ["1", "away"])
+def test_a_cancel_is_not_lost_while_the_device_takes_jobs_back(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The device had 1 and was killed; the other one came while it was away."""
+    monkeypatch.setattr(device_pool, "PAUSE_S", 0.1)
+    with pool_of(fakes.SLOW, waiting=20, cpu_waiting=20) as pool:
+        await_ready(pool)
+        take_back, cancel = pool._take_back, pool._cpu.cancel
+
+        def cancel_too_late(job_id: str) -> bool:
+            take_back()
+            pool._dispatch()
+            return cancel(job_id)
+
+        monkeypatch.setattr(pool, "_take_back", lambda: None)
+        asked = {one: submit(pool, one, fakes.SLOW, steps=30) for one in ("0", "1")}
+        until(lambda: pool.busy == 2)
+        assert pool.pid is not None
+        os.kill(pool.pid, signal.SIGKILL)
+        until(lambda: pool.restarts == 1)
+        asked["away"] = submit(pool, "away", fakes.SLOW, steps=30)
+        await_ready(pool)
+        monkeypatch.setattr(pool._cpu, "cancel", cancel_too_late)
+        assert pool.cancel(name)
+        end, steps = ended(asked[name])
+        assert isinstance(end, JobEnded)
+        assert (end.outcome, steps < 30) == (IndentationOutcome.CANCELLED, True)
+
+
+def test_workers_solve_what_indenters_the_device_lacks() -> None:
+    with pool_of(fakes.QUICK) as pool:
+        await_ready(pool)
+        for indenter in ("sphere_7mm", "sphere_5mm", "plate"):
+            end, steps = ended(submit(pool, indenter, fakes.QUICK, indenter=indenter))
+            assert isinstance(end, JobEnded), end
+            assert (end.outcome, steps) == (IndentationOutcome.COMPLETE, 4)
+        assert pool.redone == 0
 
 
 def test_a_job_that_ends_devices_is_left_to_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -477,11 +477,13 @@ def test_devices_that_there_are_are_listed() -> None:
 
 
 def test_the_command_says_what_ran_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With an indenter that is not one of the nine."""
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(cli_model, "DEFAULT_FACTORY", "fem_fakes:round_finger")
     words = (
-        "--sweep", "--points", 1, "--steps", 3, "--store", tmp_path / "a.sim", "--indenter", "cube",
-        "--device", "cpu", "--device", "cpu", "--slots", 4, "--friction", fakes.QUICK,
+        "--sweep", "--points", 1, "--steps", 3, "--store", tmp_path / "a.sim",
+        "--indenter", "sphere_5mm", "--device", "cpu", "--device", "cpu", "--slots", 4,
+        "--friction", fakes.QUICK,
     )  # fmt: skip
     done = command(*words)
     assert done.exit_code == 0

@@ -7,6 +7,8 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -14,11 +16,14 @@ from numpy.typing import NDArray
 from tests.fem.mesh_measures import solid_volume
 
 from palpate.errors import ConfigError
+from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.check import check_mesh, scaled_jacobians
 from palpate_fem.mesh.parametric import GRID_M, NAIL_X_M, NAIL_Y_M, biotac
 from palpate_fem.mesh.shape import CavityShape, CoreShape
 from palpate_fem.mesh.solid import FingertipGeometry
 from palpate_fem.mesh.surface import enclosed_volume, face_vectors, node_normals
+from palpate_fem.population.responses import geometry_of
+from palpate_fem.store.content import StoredFingertip
 
 Floats = NDArray[np.float64]
 
@@ -184,6 +189,17 @@ def test_elements_are_good_over_the_whole_range(
 def test_what_is_out_of_range_is_refused_by_name(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         biotac(**wrong)  # type: ignore[arg-type]
+
+
+def test_the_edge_is_in_whole_micrometres_as_the_name_holds_it() -> None:
+    """Else a store's mesh could not be built again for its electrodes."""
+    with pytest.raises(ConfigError, match="whole micrometres") as refused:
+        biotac(edge_m=1.2346e-3)
+    assert refused.value.remedy == "give 0.001235, or as an option 1.235 mm"
+    geometry = biotac(edge_m=1.235e-3)
+    stored = SimpleNamespace(mesh=geometry.mesh, parameters=FingertipParameters())
+    again = geometry_of(cast("StoredFingertip", stored))
+    assert again.mesh.sha256 == geometry.mesh.sha256
 
 
 def test_the_mesh_has_the_same_bits_on_other_processors() -> None:

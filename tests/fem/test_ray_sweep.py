@@ -283,8 +283,8 @@ def test_the_command_says_what_ran_where(
 
     monkeypatch.setattr(ray_batch, "RayCluster", join)
     words = (
-        "--sweep", "--points", 1, "--steps", 3, "--indenter", "cube", "--friction", fakes.QUICK,
-        "--workers", 1, "--store", tmp_path / "a.sim", "--ray", "head:6379",
+        "--sweep", "--points", 1, "--steps", 3, "--indenter", "sphere_5mm", "--friction",
+        fakes.QUICK, "--workers", 1, "--store", tmp_path / "a.sim", "--ray", "head:6379",
     )  # fmt: skip
     done = fem("run", *words, "--device", "cpu", "--slots", 4)
     assert done.exit_code == 0

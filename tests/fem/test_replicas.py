@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,6 +22,7 @@ from palpate.client import Client
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import LinkError, PalpateError, RemoteError
 from palpate.messages import ServiceState, SimulationOutcome, SimulationReply
+from palpate_fem.mesh.nvlabs import PARTS, SKIN
 from palpate_fem.service import node
 from palpate_fem.service.config import FemConfig
 
@@ -330,3 +332,15 @@ def test_many_may_ask_in_the_same_instant(
         for each in threads:
             each.join(PATIENCE_S)
     assert ends == ["COMPLETE"] * waiting
+
+
+def test_replicas_with_a_mesh_of_files_are_compared_by_the_files(tmp_path: Path) -> None:
+    """Two hosts may have them in other folders, or other ones in folders of one name."""
+    digests = []
+    for name, content in (("here", "a"), ("there", "a"), ("there", "b")):
+        for file in (SKIN, PARTS):
+            (tmp_path / name / file).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name / file).write_text(content)
+        values = {"options": {"mesh": str(tmp_path / name)}}
+        digests.append(node.answers_digest(parse_config(FemConfig, values, where="test")))
+    assert digests[0] == digests[1] != digests[2]

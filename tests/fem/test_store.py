@@ -172,6 +172,10 @@ def test_failed_simulation_leaves_no_trace(path: Path, tip: StoredFingertip) -> 
         (lambda tip: sample_fingertip(divisions=5), r"mesh sample 5 x 2 \(.*divisions 5 is not 4"),
         (lambda tip: replace(tip, pressurised_nodes=tip.pressurised_nodes + 1e-6), "1.* um away"),
         (lambda tip: replace(tip, pressurised_nodes=tip.pressurised_nodes * np.nan), "nan um away"),
+        (lambda tip: replace(tip, core_vertices=tip.core_vertices * 0.9), "the core is not"),
+        (lambda tip: replace(tip, core_vertices=tip.core_vertices[:-1]), "the core is not"),
+        (lambda tip: replace(tip, core_faces=tip.core_faces[:, [0, 2, 1]]), "the core is not"),
+        (lambda tip: replace(tip, fluid_volume_m3=1.1 * tip.fluid_volume_m3), "fluid volume of"),
     ],
 )  # fmt: skip
 def test_another_fingertip_is_refused(
@@ -185,6 +189,8 @@ def test_another_fingertip_is_refused(
         tip,
         settings={**tip.settings, "divisions": np.int64(4)},  # type: ignore[dict-item]
         pressurised_nodes=tip.pressurised_nodes + 1e-12,
+        core_vertices=tip.core_vertices + 1e-12,
+        fluid_volume_m3=tip.fluid_volume_m3 * (1.0 + 1e-9),
     )
     StoreWriter(path, same).close()
 
@@ -234,8 +240,23 @@ def test_export_is_the_same_store(
     with pytest.raises(DatasetError, match="one file already"):
         export(store, path.with_name("again.h5"))
     with pytest.raises(DatasetError, match="no 'cube'"):
-        export(SimulationStore.open(path), single, ids=["cube"])
-    assert SimulationStore.open(single).check() == 2, "a failed export leaves the file as it was"
+        export(SimulationStore.open(path), path.with_name("again.h5"), ids=["cube"])
+    assert sorted(path.parent.iterdir()) == sorted([path, single]), "it leaves nothing behind"
+
+
+def test_export_replaces_nothing(path: Path) -> None:
+    """Not even what appears while it copies."""
+    single = path.with_suffix(".h5")
+
+    def write_another(*_: int) -> None:
+        single.write_bytes(b"mine")
+
+    with pytest.raises(ConfigError, match="is there already"):
+        export(SimulationStore.open(path), single, progress=write_another)
+    assert single.read_bytes() == b"mine"
+    assert sorted(path.parent.iterdir()) == sorted([path, single])
+    with pytest.raises(ConfigError, match="is there already"):
+        export(SimulationStore.open(path), single)
 
 
 def test_export_onto_a_full_disk(path: Path) -> None:

@@ -218,6 +218,25 @@ def test_disk_error_keeps_what_was_finished(
     assert SimulationStore.open(path).check() == 2
 
 
+def test_a_disk_that_becomes_read_only_is_told_and_releases_every_claim(
+    tmp_path: Path, tip: StoredFingertip, press: IndentationResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    with StoreWriter(tmp_path / "sweep.sim", tip, shared=True) as store:
+        claims = [store.claim(f"press/{k}") for k in range(2)]
+        with monkeypatch.context() as patched:
+            for name in ("write", "unlink"):
+                patched.setattr(os, name, refuse)
+            with pytest.raises(StoreDiskError, match="Read-only"), claims[0] as claim:
+                claim.write(press)
+            claims[1].close()
+        for k in range(2):
+            store.write(f"press/{k}", press)
+        assert store.check() == 2
+
+
 def test_write_that_stops_halfway(tmp_path: Path) -> None:
     """The kernel itself cuts the file off, at 4096 bytes."""
     said = _output(_python(FULL, tmp_path / "sweep.sim"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import queue
@@ -27,6 +28,7 @@ from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.service import pool
 from palpate_fem.service.batch import BatchReport, OnReport, SimulationBatch, sweep_into_store
 from palpate_fem.service.jobs import JobEvent, JobStarted, Pressurising, WorkerSetup
+from palpate_fem.store.content import StoredFingertip
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.trajectory import PlannedIndentation
 
@@ -72,6 +74,19 @@ def test_all_are_run() -> None:
     report, kept = run(fakes.QUICK, 7, workers=2)
     assert (report.done, report.outcomes["complete"], report.early) == (7, 7, [])
     assert all(len(trajectory.steps) == STEPS for trajectory in kept)
+
+
+def test_one_fingertip_is_kept_of_all_that_workers_report() -> None:
+    def held() -> int:
+        gc.collect()
+        return sum(type(one) is StoredFingertip for one in gc.get_objects())
+
+    before = held()
+    with batch_of(fakes.QUICK) as batch:
+        first = batch.fingertip(threading.Event())
+        batch.run(plans(9), 9, stop=threading.Event(), on_trajectory=lambda *_: None)
+        assert batch.fingertip(threading.Event()) is first
+        assert held() <= before + 2  # one may still be on its way
 
 
 @pytest.mark.parametrize(

@@ -246,6 +246,25 @@ def test_a_store_is_compared_with_itself_without_error(
     assert len(measured_from(exported)[0]) == 1
 
 
+def test_a_path_that_comes_back_to_its_start_is_compared(tmp_path: Path) -> None:
+    tip = sample_fingertip(divisions=4)
+    press = sample_trajectory(tip, steps=12)
+    clear = replace(press.steps[0], pose=press.path[0], force=np.zeros(3))
+    back = replace(
+        press,
+        path=np.concatenate([press.path, press.path[-2::-1]]),
+        steps=(*press.steps, *press.steps[-2::-1], clear),
+    )
+    with StoreWriter(tmp_path / "back.sim", tip, command="test") as writer:
+        writer.write("sphere_medium/00/back", back)
+    items, _ = measured_from(tmp_path / "back.sim")
+    runs, refused = simulated_from(SimulationStore.open(tmp_path / "back.sim"), items)
+    assert not refused
+    found = validate(items, runs, threshold_n=LIGHT_N)
+    assert not found.excluded
+    assert [item.rms_n for item in found.compared] == [pytest.approx(0.0, abs=1e-12)]
+
+
 def test_a_stored_simulation_serves_each_sensor_from_its_own_start(store: SimulationStore) -> None:
     """The measured path begins 2 mm further out; the depth offset is not touched by that."""
     (item,), _ = measured_from(store.path)

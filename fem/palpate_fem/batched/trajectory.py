@@ -1,9 +1,10 @@
 """What one trajectory of a batch asks for next: load stepping as a generator.
 
-The decisions are those of ``load_stepping``; Newton's iterations are the same generator that serves
-one state (``iteration``); the arrays are elsewhere (``fingertip``). A generator yields one request
-at a time and is resumed with its answer, so each trajectory goes its own way, and the solver serves
-many requests of a kind at once.
+The decisions are those of ``load_stepping``, but that a snap ends a trajectory at once where the
+CPU tries shorter increments; Newton's iterations are the same generator that serves one state
+(``iteration``); the arrays are elsewhere (``fingertip``). A generator yields one request at a time
+and is resumed with its answer, so each trajectory goes its own way, and the solver serves many
+requests of a kind at once.
 """
 
 from __future__ import annotations

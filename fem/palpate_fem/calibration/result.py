@@ -182,8 +182,6 @@ def read_parameters(path: Path) -> FingertipParameters:
             raise KeyError("schema")
         return FingertipParameters(**content["parameters"])
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
-        if isinstance(error, ConfigError):
-            raise
         raise ConfigError(
             f"{path}: not a calibration of schema {SCHEMA} {SCHEMA_VERSION} ({error!r})",
             remedy="make it with `palpate fem calibrate`",

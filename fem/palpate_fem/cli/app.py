@@ -496,13 +496,17 @@ def serve(
         str, typer.Option("--station", envvar="PALPATE_STATION", help="Name of the station.")
     ] = "lab",
     sensor: Annotated[str, typer.Option("--sensor", help="Sensor name of the service.")] = "twin",
-    workers: WorkersOption = 0,
+    workers: Annotated[
+        int,
+        typer.Option("--workers", min=0, help="Solver processes; 0 = one for each core, to 64."),
+    ] = 0,
     device: Annotated[
         str | None,
         typer.Option(
             metavar="NAME|auto",
-            help="Solve requests with the parameters of this command together on a GPU (cuda:0, "
-            "...); auto = the first one, if there is one. --workers do all else.",
+            help="Solve requests with the parameters of this command and one of the nine indenters "
+            "together on a GPU (cuda:0, ...); auto = the first one, if there is one. --workers do "
+            "all else.",
         ),
     ] = None,
     slots: Annotated[

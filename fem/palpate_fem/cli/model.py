@@ -45,6 +45,7 @@ class FingertipModel:
         *,
         jobs: int | None,
         limit_s: float,
+        indenters: tuple[str, ...],
         devices: Sequence[str] = (),
         slots: int | None = None,
         ray: str | None = None,
@@ -56,6 +57,7 @@ class FingertipModel:
                 make files.
             jobs: Number of trajectories, if it is known.
             limit_s: Longest time for one [s].
+            indenters: Names of all that trajectories may have.
             devices: Warp devices that solve many trajectories at once; none = the CPU.
             slots: Trajectories at once on each device; None = the usual number.
             ray: Address of a cluster on which they run; ``devices`` are then its.
@@ -64,10 +66,10 @@ class FingertipModel:
         if ray is not None:
             device = devices[0] if devices else None
             make = partial(ray_batch, ray, setup, device=device, slots=slots or SLOTS)
-            return partial(make, limit_s=limit_s), cluster_packers(workers)
+            return partial(make, limit_s=limit_s, indenters=indenters), cluster_packers(workers)
         if devices:
             threads, packers = threads_and_packers(devices, workers)
-            batch = partial(DeviceBatch, setup, devices, slots=slots or SLOTS)
+            batch = partial(DeviceBatch, setup, devices, slots=slots or SLOTS, indenters=indenters)
             return partial(batch, threads=threads, limit_s=limit_s), packers
         count, threads = workers_for(workers, jobs)
         return partial(SimulationBatch, setup, workers=count, threads=threads, limit_s=limit_s), 0

@@ -41,7 +41,7 @@ from palpate_fem.service.device_process import check_places, wanted_device
 from palpate_fem.service.fingertips import check_start, skin_of
 from palpate_fem.store.content import StoredFingertip, TrajectorySummary
 from palpate_fem.store.read import SimulationStore
-from palpate_fem.store.writer import export
+from palpate_fem.store.writer import check_free, export
 from palpate_fem.trajectory import (
     Campaign,
     angled_direction,
@@ -190,15 +190,18 @@ class RunOptions:
             return self.devices
         return (f"the {'GPUs' if 'cuda' in self.devices else 'CPUs'} of the Ray cluster",)
 
+    @property
+    def swept(self) -> tuple[str, ...]:
+        """The indenters of a sweep, each once, as one may have several names."""
+        named = dict.fromkeys(make_indenter(name).name for name in self.indenters)
+        return tuple(named) or indenter_names()
+
     def plans(self, fingertip: StoredFingertip) -> Sequence[TrajectoryPlan]:
         """The trajectories to run on a fingertip."""
         skin = skin_of(fingertip)
         if self.sweep:
-            # An indenter has several names.
-            named = dict.fromkeys(make_indenter(name).name for name in self.indenters)
-            names = tuple(named) or indenter_names()
             return points_first(
-                Campaign(skin, names, self.points, self.seed, self.steps, angled=self.angled)
+                Campaign(skin, self.swept, self.points, self.seed, self.steps, angled=self.angled)
             )
         indenter = make_indenter((self.indenters or (DEFAULT_INDENTER,))[0])
         if self.poses is not None:
@@ -238,6 +241,7 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
         workers,
         jobs=None if sweep else 1,
         limit_s=options.limit_s,
+        indenters=options.swept,
         devices=options.devices,
         slots=options.slots,
         ray=options.ray,
@@ -315,8 +319,7 @@ def export_command(store: Path, out: Path) -> None:
         raise ConfigError(
             f"{out} does not end in {EXPORT_SUFFIX}", remedy=f"call it {out.stem}{EXPORT_SUFFIX}"
         )
-    if out.exists():
-        raise ConfigError(f"{out} is there already", remedy="name another file, or remove it")
+    check_free(out)  # before the store is checked, which takes long
     opened = SimulationStore.open(store)
     with progress_bar() as bar:
         task = bar.add_task("check", total=None)
@@ -353,18 +356,17 @@ def serve_command(
     """
     # Only this command needs the bus.
     from palpate_fem.service import node
-    from palpate_fem.service.config import FemConfig
+    from palpate_fem.service.config import WORKERS_MOST, FemConfig
 
     if slots is not None and device is None:
         raise ConfigError("--slots without --device", remedy=_NAME_THE_DEVICE)
     device = wanted_device(device)
-    count, threads = workers_for(workers)
+    count = workers or min(workers_for(0)[0], WORKERS_MOST)
     config = parse_config(
         FemConfig,
         {
             "sensor": sensor,
             "workers": count,
-            "threads": threads,
             "device": device,
             **({} if slots is None else {"slots": slots}),
             "waiting": waiting,

@@ -130,7 +130,8 @@ class ParameterGradients:
         fluid_volume_m3: By the fluid's volume [1/m^3].
         total_thickness_m: By the total thickness [1/m].
         poses: By the poses of the path, (K, 6): positions [1/m], and small turns about the tip, as
-            rotation vectors in the sensor frame [1/rad].
+            rotation vectors in the sensor frame [1/rad]. K counts the poses that an increment of
+            the history reached or went towards: fewer than the path has if it ended early.
     """
 
     skin_thickness_m: float

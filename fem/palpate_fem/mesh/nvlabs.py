@@ -6,6 +6,7 @@ used: the skin is extruded from it along smoothed normals. palpate ships none of
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +163,21 @@ def read_nvlabs(
     )
     check_mesh(mesh)
     return FingertipGeometry(mesh, _core(core, cavity))
+
+
+def files_digest(folder: Path) -> str:
+    """Digest, hex, of the files that `read_nvlabs` reads.
+
+    Raises:
+        ConfigError: One cannot be read.
+    """
+    digest = hashlib.sha256()
+    for path in (folder / SKIN, folder / PARTS):
+        try:
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+        except OSError as error:
+            raise ConfigError(f"{path} cannot be read: {error}", remedy=REMEDY) from error
+    return digest.hexdigest()
 
 
 def _compact(points: Floats, faces: Ints) -> TriangleSurface:

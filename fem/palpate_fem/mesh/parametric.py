@@ -68,8 +68,9 @@ def biotac(
 
     Args:
         thickness_m: Thickness of the skin [m].
-        edge_m: Edge of a quad on the ventral and lateral inner surface [m]; those on the outer one
-            are longer by a quarter, dorsal ones up to `COARSENING` times as wide.
+        edge_m: Edge of a quad on the ventral and lateral inner surface [m], in whole micrometres;
+            those on the outer one are longer by a quarter, dorsal ones up to `COARSENING` times as
+            wide.
         layers: Hexahedra through the thickness.
         cavity: Shape of the inner surface; None = the BioTac's. The grid is laid for shapes near
             to that one.

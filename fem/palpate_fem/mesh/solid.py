@@ -167,10 +167,10 @@ class FingertipGeometry:
 
 
 def check_limits(**arguments: float) -> None:
-    """Refuse arguments of a builder that are not finite or outside `BUILDER_LIMITS`.
+    """Refuse arguments of a builder that are outside `BUILDER_LIMITS`, and edges in parts of um.
 
     Raises:
-        ConfigError: Names the argument and its limits.
+        ConfigError: Names the argument, and its limits or the nearest edge.
     """
     for name, value in arguments.items():
         low, high = BUILDER_LIMITS[name]
@@ -178,4 +178,11 @@ def check_limits(**arguments: float) -> None:
             raise ConfigError(
                 f"{name} = {value} is not within [{low:g}, {high:g}]",
                 remedy="stay within these limits; lengths are in metres here, in mm as options",
+            )
+        # The mesh's name holds its edge in whole um: from it a store's mesh is built again.
+        nearest_m = round(value * 1e6) / 1e6
+        if name == "edge_m" and abs(value - nearest_m) > 1e-12:
+            raise ConfigError(
+                f"edge_m = {value} is not in whole micrometres",
+                remedy=f"give {nearest_m:g}, or as an option {nearest_m * 1e3:g} mm",
             )

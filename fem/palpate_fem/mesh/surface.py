@@ -41,7 +41,7 @@ def enclosed_volume(points: Floats, faces: Ints) -> float:
 def node_normals(points: Floats, faces: Ints) -> Floats:
     """Unit normals at the nodes: mean of the adjacent faces weighted with their angle there.
 
-    The angle as weight makes the normal independent of how a flat region is cut into faces, and is
+    The angle as weight makes the normal independent of how a flat region is cut into faces, and
     gives the right sign of the distance at a node (Baerentzen, Aanaes 2005).
 
     Returns:

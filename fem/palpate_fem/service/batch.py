@@ -184,8 +184,8 @@ class SimulationBatch(Closing):
     ) -> None:
         self._setup = setup
         self._limit_s = limit_s
-        self._fingertip: queue.SimpleQueue[StoredFingertip] = queue.SimpleQueue()
         self._first: StoredFingertip | None = None
+        self._has_first = threading.Event()
         self._events: queue.SimpleQueue[tuple[TrajectoryPlan, JobEvent]] = queue.SimpleQueue()
         self._pool = WorkerPool(
             setup,
@@ -193,17 +193,15 @@ class SimulationBatch(Closing):
             threads=threads,
             waiting=workers,
             grace_s=grace_s,
-            on_fingertip=self._fingertip.put,
+            on_fingertip=self._keep_first,
         )
         self.ahead = workers + 1
 
     def fingertip(self, stop: threading.Event) -> StoredFingertip | None:
         """See ``TrajectoryBatch.fingertip``."""
-        while self._first is None and not stop.is_set():
+        while not (self._has_first.wait(_POLL_S) or stop.is_set()):
             if self._pool.broken is not None:
                 raise self._pool.broken
-            with contextlib.suppress(queue.Empty):
-                self._first = self._fingertip.get(timeout=_POLL_S)
         return self._first
 
     def run(
@@ -252,6 +250,12 @@ class SimulationBatch(Closing):
     def close(self) -> None:
         """End the workers."""
         self._pool.close()
+
+    def _keep_first(self, fingertip: StoredFingertip) -> None:
+        # Workers report it with every trajectory, and each copy has a megabyte.
+        if not self._has_first.is_set():
+            self._first = fingertip
+            self._has_first.set()
 
     def _submit(self, plan: TrajectoryPlan, steps: dict[str, list[IndentationStep]]) -> None:
         job = SimulationJob(plan.name, self._setup.warm, plan.indenter, plan.path, self._limit_s)

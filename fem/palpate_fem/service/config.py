@@ -12,6 +12,9 @@ from palpate_fem.config import FingertipParameters
 
 DEFAULT_FACTORY = "palpate_fem.service.biotac:biotac"
 
+WORKERS_MOST = 64
+"""Solver processes of a service."""
+
 
 class FingertipTable(StrictConfig):
     """Default parameters of requests; None = the paper's, see ``FingertipParameters``."""
@@ -44,8 +47,9 @@ class FemConfig(StrictConfig):
         max_steps: Most steps of a request.
         max_deadline_s: Longest time for a request, waiting included [s].
         grace_s: Time after its deadline at which a solver that still runs is killed [s].
-        device: Device that solves many requests at once, e.g. ``cuda:0``, if their parameters are
-            those of ``fingertip``; ``auto`` = the first GPU if there is one; None = workers alone.
+        device: Device that solves many requests at once, e.g. ``cuda:0``, if their indenter is one
+            of the nine and their parameters are those of ``fingertip``; ``auto`` = the first GPU if
+            there is one; None = workers alone.
         slots: Requests at once on it; as many as ``waiting`` more may wait for it.
         keep: Number of pressurised fingertips that each worker keeps.
         fingertip: Default parameters of requests.
@@ -54,7 +58,7 @@ class FemConfig(StrictConfig):
     """
 
     sensor: Name = "twin"
-    workers: int = Field(default=2, ge=1, le=64)
+    workers: int = Field(default=2, ge=1, le=WORKERS_MOST)
     threads: int = Field(default=0, ge=0, le=256)
     waiting: int = Field(default=8, ge=0, le=1000)
     max_steps: int = Field(default=200, ge=1, lt=10_000)

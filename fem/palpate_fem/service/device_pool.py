@@ -25,7 +25,7 @@ from palpate.heartbeat import Turns
 from palpate.process import Closing
 from palpate.rigid import path_lengths
 from palpate_fem.arrays import Floats
-from palpate_fem.indenter.catalogue import indenter_names
+from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.result import IndentationOutcome, IndentationStep
 from palpate_fem.service.device_process import HANG_S, START_S, DeviceProcess
 from palpate_fem.service.jobs import (
@@ -110,11 +110,11 @@ class DeviceTask:
 class DevicePool(Closing):
     """Runs jobs on a device, and with workers; used like a `WorkerPool`.
 
-    Jobs whose parameters are those of the warm fingertip go to the device while it is ready, all
-    others to the workers. Its process is started again whenever it has ended, and gets what still
-    waits for a worker then. All events of a device are handled by one thread; workers' threads come
-    in with those of jobs that are redone. Shared state is changed under one lock, and callbacks to
-    owners run outside of it.
+    Jobs whose parameters are those of the warm fingertip and whose indenter is one of the nine go
+    to the device while it is ready, all others to the workers. Its process is started again
+    whenever it has ended, and gets what still waits for a worker then. All events of a device are
+    handled by one thread; workers' threads come in with those of jobs that are redone. Shared state
+    is changed under one lock, and callbacks to owners run outside of it.
 
     Args:
         setup: How the fingertip is made; what makes it is a ``SlottedTip``.
@@ -219,12 +219,12 @@ class DevicePool(Closing):
 
     def submit(self, job: SimulationJob, on_event: OnEvent) -> None:
         """Run a job; see ``WorkerPool.submit``."""
+        ours = self._is_ours(job)
         with self._lock:
             if self._closing.is_set():
                 raise pool_stopping()
-            process = self._ready_process()
-            ours = process is not None and job.parameters == self._setup.worker.warm
-            if process is not None and ours:
+            process = self._ready_process() if ours else None
+            if process is not None:
                 free, slots = self._setup.slots - len(process.open), self._setup.slots
                 waiting = len(self._waiting)
                 if waiting >= self._capacity + free:
@@ -233,30 +233,34 @@ class DevicePool(Closing):
                 task = DeviceTask(job, on_event, time.monotonic() + job.deadline_s)
                 self._tasks[job.id] = task
                 self._waiting.append(task)
-        if ours:
+        if process is not None:
             self._events.put(None)  # its thread looks at what waits
         else:
             self._cpu.submit(job, on_event)
 
     def cancel(self, job_id: str) -> bool:
         """Stop a job; see ``WorkerPool.cancel``."""
+        # One that came while the device was away may be taken back between the first two looks.
+        return self._cancel_task(job_id) or self._cpu.cancel(job_id) or self._cancel_task(job_id)
+
+    def _cancel_task(self, job_id: str) -> bool:
+        """Stop a job that the device was to solve; False = there is none of that id."""
         with self._lock:
             task = self._tasks.get(job_id)
-            waited = task is not None and task in self._waiting
-            if task is not None:
-                task.cancelled = True
-                if waited:
-                    self._waiting.remove(task)
-                elif self._process is not None and task.number in self._process.open:
-                    task.overdue = min(task.overdue, time.monotonic() + self._grace_s)
-                    self._process.send(StopPress(task.number))
-                    return True
-        if task is None:
-            return self._cpu.cancel(job_id)
+            if task is None:
+                return False
+            task.cancelled = True
+            waited = task in self._waiting
+            if waited:
+                self._waiting.remove(task)
+            elif self._process is not None and task.number in self._process.open:
+                task.overdue = min(task.overdue, time.monotonic() + self._grace_s)
+                self._process.send(StopPress(task.number))
+                return True
         if waited:
-            self._finish(task, JobEnded(IndentationOutcome.CANCELLED, "cancelled while it waited"))
-        else:
-            self._cpu.cancel(job_id)  # if it is not there yet, it will be seen to be cancelled
+            self._finish(task, self._cancelled_waiting(task))
+        else:  # on its way to or from the workers it is seen to be cancelled
+            self._cpu.cancel(job_id)
         return True
 
     def close(self) -> None:
@@ -276,6 +280,11 @@ class DevicePool(Closing):
     def _ready_process(self) -> DeviceProcess[DeviceTask] | None:
         process = self._process
         return process if process is not None and process.ready and not process.hung else None
+
+    def _is_ours(self, job: SimulationJob) -> bool:
+        """Whether the device can solve a job."""
+        there = make_indenter(job.indenter).name in self._setup.indenters
+        return there and job.parameters == self._setup.worker.warm
 
     def _serve(self) -> None:
         while not self._closing.is_set():
@@ -342,6 +351,10 @@ class DevicePool(Closing):
         """Give the device what waits while slots are free, and tell the others their place."""
         started: list[DeviceTask] = []
         with self._lock:
+            # Those that were cancelled while they were taken back from the workers.
+            cancelled = [task for task in self._waiting if task.cancelled]
+            for task in cancelled:
+                self._waiting.remove(task)
             process = self._ready_process()
             while process is not None and self._waiting and len(process.open) < self._setup.slots:
                 task = self._waiting.popleft()
@@ -351,6 +364,8 @@ class DevicePool(Closing):
                 process.give(NumberedPress(task.number, job.indenter, job.path, left_s), task)
                 started.append(task)
             waiting = list(self._waiting)
+        for task in cancelled:
+            self._finish(task, self._cancelled_waiting(task))
         for task in started:
             assert self._fingertip is not None
             if not task.started:
@@ -419,11 +434,10 @@ class DevicePool(Closing):
 
     def _take_back(self) -> None:
         """Give the device what still waits for a worker."""
-        warm = self._setup.worker.warm
 
         def is_mine(job: SimulationJob) -> bool:
             known = self._tasks.get(job.id)
-            return job.parameters == warm and not (known and known.workers_only)
+            return self._is_ours(job) and not (known and known.workers_only)
 
         with self._lock:
             for one in self._cpu.take_back(is_mine):
@@ -495,6 +509,10 @@ class DevicePool(Closing):
             f"{task.made} their forces are {apart_n:.3f} N apart",
             "ask again with shorter steps, or serve without --device",
         )
+
+    def _cancelled_waiting(self, task: DeviceTask) -> JobEnded:
+        how = "cancelled while it waited"
+        return self._ended(task, JobEnded(IndentationOutcome.CANCELLED, how))
 
     @staticmethod
     def _ended(task: DeviceTask, end: JobEnded) -> JobEnded:

@@ -14,6 +14,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from palpate import __version__
@@ -45,7 +46,7 @@ from palpate.messages import (
 from palpate.process import Closing
 from palpate_fem.config import FingertipParameters
 from palpate_fem.result import IndentationOutcome, IndentationStep
-from palpate_fem.service.config import FemConfig
+from palpate_fem.service.config import DEFAULT_FACTORY, FemConfig
 from palpate_fem.service.device_pool import DevicePool
 from palpate_fem.service.device_process import wanted_device
 from palpate_fem.service.fingertips import load_factory, without_friction
@@ -419,9 +420,17 @@ def _all_options(config: FemConfig) -> dict[str, Any]:
     """Arguments of the factory, those at their defaults included."""
     try:
         bound = inspect.signature(load_factory(config.factory)).bind(**config.options)
+        bound.apply_defaults()
+        if config.factory == DEFAULT_FACTORY:
+            from palpate_fem.mesh.nvlabs import files_digest
+            from palpate_fem.service.biotac import PARAMETRIC  # with all of the solver
+
+            mesh = bound.arguments["mesh"]
+            if mesh != PARAMETRIC:
+                # A replica may have the same files elsewhere, or others in a folder of that name.
+                bound.arguments["mesh"] = files_digest(Path(mesh))
     except (ConfigError, TypeError):  # the workers say what is wrong with it
         return config.options
-    bound.apply_defaults()
     return bound.arguments
 
 

@@ -384,11 +384,19 @@ class RayBatch(SlottedBatch[RayDevice]):
 
 @contextmanager
 def ray_batch(
-    address: str, setup: WorkerSetup, *, device: str | None, slots: int, limit_s: float
+    address: str,
+    setup: WorkerSetup,
+    *,
+    device: str | None,
+    slots: int,
+    limit_s: float,
+    indenters: tuple[str, ...],
 ) -> Iterator[RayBatch]:
     """Join a cluster and run trajectories there; see `RayCluster` and `RayBatch`."""
     with (
         RayCluster(address) as cluster,
-        RayBatch(cluster, setup, device=device, slots=slots, limit_s=limit_s) as batch,
+        RayBatch(
+            cluster, setup, device=device, slots=slots, limit_s=limit_s, indenters=indenters
+        ) as batch,
     ):
         yield batch

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -25,6 +26,9 @@ Outline = tuple[NDArray[np.floating[Any]], Ints]
 SAME_SHAPE_M = 1e-7
 """Pressurised shapes from the same inputs agree to this [m]: far above the solver's tolerance, far
 below what matters. A larger difference means that the solver itself has changed."""
+
+_SAME_VOLUME = 1e-3
+"""Share by which volumes of fluid may differ then; 0.1 um on the whole skin are a quarter of it."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class StoredFingertip:
 
     @cached_property
     def key(self) -> str:
-        """Digest, hex, of everything that determines a trajectory: mesh, parameters, settings."""
+        """Digest, hex, of mesh, parameters and settings; `differences` looks at the core, too."""
         digest = hashlib.sha256(self.mesh.sha256)
         for name, value in sorted({**named_values(self.parameters), **self.settings}.items()):
             # A flag or count written back as a NumPy scalar must not change the digest.
@@ -77,7 +81,19 @@ class StoredFingertip:
             apart = float(np.abs(self.pressurised_nodes - other.pressurised_nodes).max(initial=0.0))
             if not apart <= SAME_SHAPE_M:
                 found.append(f"the same inputs give a pressurised skin {apart * 1e6:.3g} um away")
+            here, there = self.fluid_volume_m3, other.fluid_volume_m3
+            if not math.isclose(here, there, rel_tol=_SAME_VOLUME):
+                found.append(f"a fluid volume of {here:.4g} m^3 is not {there:.4g}")
+            if not self._has_core_of(other):
+                found.append("the core is not the same")
         return found
+
+    def _has_core_of(self, other: StoredFingertip) -> bool:
+        mine, theirs = self.core_vertices, other.core_vertices
+        same_faces = np.array_equal(self.core_faces, other.core_faces)
+        return same_faces and bool(
+            mine.shape == theirs.shape and np.allclose(mine, theirs, rtol=0.0, atol=SAME_SHAPE_M)
+        )
 
 
 @dataclass(frozen=True, slots=True)

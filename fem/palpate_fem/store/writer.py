@@ -286,7 +286,7 @@ def export(
 
     Args:
         store: A store that is a folder.
-        path: The file to write (``.h5``); replaced if it is there.
+        path: The file to write (``.h5``); never replaced.
         ids: Trajectories to copy; None = all.
         progress: Called with the number of copied trajectories, and of all.
         command: Command line that makes the file, for provenance.
@@ -295,9 +295,11 @@ def export(
         Number of trajectories in it.
 
     Raises:
+        ConfigError: The file is there already.
         DatasetError: The store is damaged, lacks one of ``ids``, or is one file already.
         StoreDiskError: The disk is full or refuses.
     """
+    check_free(path)
     if store.path.is_file():
         raise DatasetError(f"{store.path} is one file already", remedy="copy it")
     names = store.ids() if ids is None else list(ids)
@@ -315,8 +317,19 @@ def export(
         except (OSError, RuntimeError) as error:
             told = error if isinstance(error, OSError) else OSError(str(error))
             raise disk_error(path, told) from error
+        check_free(path)  # copying takes minutes
         claim.finish()
     return len(names)
+
+
+def check_free(path: Path) -> None:
+    """Check that a file is not there.
+
+    Raises:
+        ConfigError: It is.
+    """
+    if path.exists():
+        raise ConfigError(f"{path} is there already", remedy="name another file, or remove it")
 
 
 def _copy(source: Path, group: str, target: h5py.File) -> None:

@@ -127,6 +127,8 @@ def _mismatch(simulated: TrajectorySummary, item: MeasuredIndentation) -> str:
 
 
 def _direction(path: Floats) -> Floats:
-    """From the first to the last position, unit length, shape (3,)."""
-    way = path[-1, :3] - path[0, :3]
-    return np.asarray(way / np.linalg.norm(way))
+    """From the first position to the farthest one, as a path may come back; unit length, (3,)."""
+    ways = path[:, :3] - path[0, :3]
+    far = np.linalg.norm(ways, axis=1)
+    last = int(far.argmax())
+    return np.asarray(ways[last] / max(far[last], np.finfo(float).tiny))
