@@ -8,10 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from palpate.bus import Session
 from palpate.bus.no_router import RouterAbsent
 from palpate.census import SUPERVISOR, ProcessReport
 from palpate.config import LinkConfig, endpoint_host_port
-from palpate.errors import ConfigError, LinkError
+from palpate.errors import ConfigError, DeviceLost, LinkError
+from palpate.health import Health, HealthReporter
+from palpate.messages import ServiceState, Status, SupervisedProcess
 from palpate_deploy.station.host import (
     free_endpoint,
     new_run_folder,
@@ -19,11 +22,14 @@ from palpate_deploy.station.host import (
     write_run_file,
 )
 from palpate_deploy.station.profile import parse_profile
+from palpate_deploy.station.status import show_status
 from palpate_deploy.station.troubles import (
+    Expectation,
     ask_through_router,
     expectation,
     expectation_here,
     expectation_of,
+    lifeless,
     troubles,
 )
 
@@ -147,6 +153,41 @@ def test_a_supervisor_that_hangs_is_missed_beside_a_named_profile() -> None:
     assert said is not None
     assert said.source == "profile virtual"
     assert said.processes == expectation_of("virtual").processes | {SUPERVISOR}
+
+
+def test_a_health_check_fails_only_for_what_is_missing_or_mute(
+    link: LinkConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A lost sensor is no reason to end the station that waits for it."""
+    profile = tmp_path / "lab.toml"
+    profile.write_text('processes = ["gateway"]\n', encoding="utf-8")
+    health = Health("gateway", "gateway")
+    with Session.open(link, station="lab") as session:
+        presence = session.presence("gateway", instance="gateway")
+        with HealthReporter(session, health):
+            presence.ready()
+            health.fail(DeviceLost("sensor 'thumb' is silent", remedy="plug it in"))
+            look = {"as_json": False, "profile": str(profile), "timeout_s": 1.0}
+            assert show_status(link, "lab", **look) == 1  # type: ignore[arg-type]
+            assert show_status(link, "lab", alive=True, **look) == 0  # type: ignore[arg-type]
+            assert capsys.readouterr().out.count("sensor 'thumb' is silent") >= 2, "it is told"
+            profile.write_text('processes = ["gateway", "recorder"]\n', encoding="utf-8")
+            assert show_status(link, "lab", alive=True, **look) == 1  # type: ignore[arg-type]
+
+
+def test_a_process_that_is_started_again_or_is_elsewhere_is_not_for_a_health_check() -> None:
+    gone = [ProcessReport(name, name, False, False, None) for name in ("web", "features", "fem")]
+    processes = (
+        SupervisedProcess("web", "web", "backoff", 0, 3, 0.0),
+        SupervisedProcess("features", "features", "starting", 4711, 0, 1.0),
+    )
+    state = ServiceState.DEGRADED
+    status = Status(*SUPERVISOR, state, 10**12, 0, 60.0, "1", processes=processes)
+    census = [*gone, ProcessReport(*SUPERVISOR, True, True, status)]
+    assert {one.service for one in troubles(census)} == {"web", "features", "fem", "supervisor"}
+    assert {one.service for one in lifeless(census)} == {"features", "fem"}
+    own = Expectation("profile lab", frozenset((name, name) for name in ("web", "features")))
+    assert {one.service for one in lifeless(census, own)} == {"features"}
 
 
 def test_a_full_disk_of_state_is_told_with_a_remedy() -> None:

@@ -118,6 +118,12 @@ def run(
 @app.command(epilog=example("palpate status", "palpate status --profile virtual --json"))
 def status(
     profile: WantedOption = None,
+    alive: Annotated[
+        bool,
+        typer.Option(
+            "--alive", help="Fail only if one is missing or does not answer: for health checks."
+        ),
+    ] = False,
     connect: ConnectOption = DEFAULT_CONNECT,
     tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
@@ -127,7 +133,7 @@ def status(
     from palpate_deploy.station.status import show_status
 
     link, station = station_link(profile, connect, station, tls)
-    raise typer.Exit(show_status(link, station, as_json=json_, profile=profile))
+    raise typer.Exit(show_status(link, station, as_json=json_, profile=profile, alive=alive))
 
 
 @app.command(epilog=example("palpate top", "palpate top --once", "palpate top --json"))
