@@ -25,6 +25,7 @@ from palpate.files.outputs import check_output
 from palpate.files.record import RecordSummary, check_readable, recover, summarise
 from palpate.health import Health
 from palpate.process import stop_on_signals
+from palpate_deploy.station.host import check_room
 from palpate_deploy.station.logs import cell
 from palpate_deploy.station.status import duration_text
 
@@ -65,7 +66,7 @@ def record_station(
     from palpate_services.recorder.writer import leftovers
 
     config = parse_config(RecorderConfig, {**EVERYTHING, **settings}, where="command line")
-    _check_room(config.out, config.min_free_bytes)
+    check_room(config.out, config.min_free_bytes)
     Session.open(link, station=station).close()  # raises at once if there is no router
     before = set(config.out.glob("*.mcap"))
     stop = stop_on_signals()
@@ -119,19 +120,6 @@ def record_station(
     if all(key.sensor == own for key in keys):  # its status
         raise LinkError(
             f"nothing came of station {station!r}", remedy="see what runs: palpate status"
-        )
-
-
-def _check_room(out: Path, least: int) -> None:
-    """Refuse a disk on which the recorder would pause from its first message on."""
-    from palpate_services.recorder.writer import free_bytes
-
-    folder = out.absolute()
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    if (free := free_bytes(existing)) < least:
-        raise RecordingError(
-            f"{out} has {free / 1e6:,.0f} MB free, a record needs {least / 1e6:,.0f} MB",
-            remedy="free some space, or record to a folder on another disk: --out",
         )
 
 

@@ -1,4 +1,4 @@
-"""What a run needs of this host: free ports, and a folder for its profile and logs."""
+"""What a run needs of this host: free ports, room on a disk, a folder for its profile and logs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import tomli_w
 
 from palpate.bus import Session
 from palpate.config import Role, endpoint_host_port
-from palpate.errors import ConfigError, LinkError
+from palpate.errors import ConfigError, LinkError, RecordingError
 from palpate.process import state_folder
 from palpate_deploy.station.profile import Profile, changed, load_profile, plain_values
 
@@ -45,6 +45,23 @@ def check_free(endpoints: Iterable[str]) -> None:
                 f"the router cannot listen at {endpoint}: {error.strerror or error}",
                 remedy="set [router] listen to an address of this host",
             ) from error
+
+
+def check_room(out: Path, least: int) -> None:
+    """Check that a recorder, which pauses below ``least`` free bytes, can write to a folder.
+
+    Raises:
+        RecordingError: It would pause from its first message on.
+    """
+    from palpate_services.recorder.writer import free_bytes  # slow to import
+
+    folder = out.absolute()
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if (free := free_bytes(existing)) < least:
+        raise RecordingError(
+            f"{out} has {free / 1e6:,.0f} MB free, a record needs {least / 1e6:,.0f} MB",
+            remedy="free some space, or record to a folder on another disk: --out",
+        )
 
 
 def free_endpoint() -> str:
