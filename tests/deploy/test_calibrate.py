@@ -22,6 +22,7 @@ import pytest
 from rich.console import Console
 
 import palpate_training
+from palpate.admin import make_token, token_file
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig
@@ -31,7 +32,7 @@ from palpate.health import Health
 from palpate.messages import NO_TARE, QualityFlag
 from palpate_deploy.station import calibrate, guided_presses
 from palpate_deploy.station.guided_presses import HELD_S, PressCounter
-from palpate_services.config import RecorderConfig
+from palpate_services.config import ModelsConfig, RecorderConfig
 from palpate_services.inference.repository import resolve
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
@@ -300,6 +301,27 @@ def test_a_record_of_another_finger_is_not_learned_from(
         calibrate.calibrate_finger(
             LinkConfig(), "lab", order, token=None, profile=None, as_json=True
         )
+
+
+@pytest.mark.parametrize(
+    ("serve", "problem"),
+    [(False, r"\[models\] folder: .* is no folder"), (True, "no service 'features' answers")],
+)
+def test_nobody_presses_for_a_bundle_that_cannot_be_kept_or_served(
+    link: LinkConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    serve: bool,
+    problem: str,
+) -> None:
+    if serve:
+        make_token(token_file(ModelsConfig().memory_folder, "lab"))
+    else:
+        (tmp_path / "data").touch()
+    monkeypatch.setattr(calibrate, "record_presses", lambda *_, **__: pytest.fail("pressed"))
+    order = calibrate.CalibrationOrder("finger", 7, tmp_path / "rec", None, "", serve=serve)
+    with pytest.raises((ConfigError, LinkError), match=problem):
+        calibrate.calibrate_finger(link, "lab", order, token=None, profile=None, as_json=True)
 
 
 def test_a_version_that_another_takes_meanwhile_is_left_to_it(
