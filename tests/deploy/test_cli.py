@@ -269,6 +269,14 @@ def test_doctor_warns_of_sensors_that_no_gateway_has() -> None:
     assert doctor._sensors(alone)[0] == "ok"
 
 
+def test_doctor_takes_the_folder_of_a_bag(tmp_path: Path) -> None:
+    """A bag of ROS 2 is one."""
+    for path, grade in ((tmp_path, "ok"), (tmp_path / "gone", "fail")):
+        sensor = {"name": "finger", "driver": "ros_bag", "options": {"path": str(path)}}
+        profile = changed(load_profile("virtual"), gateway={"sensors": [sensor]})
+        assert doctor._sensors(profile)[0] == grade
+
+
 def test_a_tare_over_many_frames_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[int, float] = {}
 
