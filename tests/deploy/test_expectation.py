@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,9 +17,13 @@ from palpate.config import LinkConfig, endpoint_host_port
 from palpate.errors import ConfigError, DeviceLost, LinkError
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState, Status, SupervisedProcess
+from palpate.process import state_folder
 from palpate_deploy.station.host import (
+    KEPT_RUNS,
+    RUN_LOCK,
     free_endpoint,
     new_run_folder,
+    running_folders,
     write_profile,
     write_run_file,
 )
@@ -75,13 +81,34 @@ def test_a_run_of_this_host_is_found_by_router_and_station() -> None:
 def test_the_newest_run_counts_and_one_that_has_ended_does_not() -> None:
     here = free_endpoint()
     ended = a_run(here)
-    ended.rename(ended.with_name(f"99999999-999999-mine-{2**22 + 5}"))
+    (ended / RUN_LOCK).unlink()
+    ended.rename(ended.with_name(f"99999999-999999-mine-{os.getpid()}"))
     assert expectation_here([here], "lab") is None
     finite = a_run(here, supervised=False)
     finite.rename(finite.with_name(f"20990101-000000-replay-{os.getpid()}"))
     said = expectation_here([here], "lab")
     assert said is not None
     assert said.processes == names()
+
+
+def test_folders_of_ended_runs_go_although_a_process_has_their_id() -> None:
+    """In a container every start has the same one."""
+    runs = state_folder() / "runs"
+    for number in range(2 * KEPT_RUNS):
+        (runs / f"20260101-{number:06d}-lab-{os.getpid()}").mkdir(parents=True)
+    running = new_run_folder("lab")
+    running = running.rename(runs / f"20250101-000000-lab-{2**22 + 5}")
+    other = runs / "0-somebody-elses"
+    other.mkdir()
+    for _ in range(2):
+        new_run_folder(f"lab{_}")
+    assert {running, other} < {*runs.iterdir()}
+    assert len([*runs.iterdir()]) == KEPT_RUNS + 2
+    assert running in running_folders()
+    made = "from palpate_deploy.station.host import new_run_folder; print(new_run_folder('lab'))"
+    done = subprocess.run([sys.executable, "-c", made], capture_output=True, text=True, check=True)
+    assert Path(done.stdout.strip()).is_dir()
+    assert Path(done.stdout.strip()) not in running_folders()
 
 
 def test_a_damaged_folder_is_passed_over() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import shutil
 import socket
@@ -112,6 +113,10 @@ KEPT_RUNS = 20
 """Older folders are removed; records are never stored there."""
 
 
+RUN_LOCK = "running"
+"""File in the folder of a run that its process holds locked: another one may have its id later."""
+
+
 def new_run_folder(name: str) -> Path:
     """Make an empty folder for a run, and remove those of the oldest runs.
 
@@ -123,6 +128,8 @@ def new_run_folder(name: str) -> Path:
     folder = runs / f"{stamp}-{name}-{os.getpid()}"
     try:
         (folder / "logs").mkdir(parents=True, mode=0o700)
+        # Never closed: the kernel gives the lock back when this process ends, however it does.
+        fcntl.flock(os.open(folder / RUN_LOCK, os.O_CREAT | os.O_WRONLY, 0o600), fcntl.LOCK_EX)
     except OSError as error:
         raise ConfigError(
             f"run folder {folder} cannot be made: {error.strerror or error}",
@@ -151,16 +158,14 @@ def run_pid(folder: Path) -> int:
 
 def _in_use(folder: Path) -> bool:
     """Whether the process that made a run's folder still runs."""
-    pid = run_pid(folder)
-    if not pid:
-        return True  # made by something else
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
+        with open(folder / RUN_LOCK, "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return not run_pid(folder)  # made by something else
+    except OSError:
         return True
-    return True
+    return False
 
 
 def write_profile(profile: Profile, folder: Path) -> Path:
