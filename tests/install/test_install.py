@@ -604,6 +604,33 @@ def test_all_is_as_it_was_when_systemd_refuses(
     assert difference(installed, contents(root)) == []
 
 
+def test_a_unit_that_is_needed_no_more_is_stopped_when_all_else_is_done(
+    root: Path, tmp_path: Path, install: Install, this_host: Path
+) -> None:
+    profile = tmp_path / "lab.toml"
+    profile.write_text(PROFILES["elements"].replace("biotac_can", "virtual"), encoding="utf-8")
+    install()
+    before = contents(root)
+    profile.write_text(VIRTUAL, encoding="utf-8")
+    this_host.write_text("")
+    failing = Path(f"{this_host}.fail")
+    failing.write_text("enable\n")
+    with pytest.raises(InstallError, match="systemctl enable"):
+        install()
+    assert difference(before, contents(root)) == []
+    told = this_host.read_text()
+    assert "disable" not in told, "it still runs"
+    assert "daemon-reload" in told.partition("systemctl enable")[2], "systemd knows the old units"
+    failing.unlink()
+    this_host.write_text("")
+    install()
+    told = this_host.read_text()
+    stopped = "systemctl disable --now --quiet palpate-fem@lab.service"
+    assert stopped in told.partition("systemctl enable")[2]
+    assert "daemon-reload" in told.partition(stopped)[2], "systemd forgets it"
+    assert not (root / "etc/systemd/system/palpate-fem@lab.service").exists()
+
+
 def test_rollback_to_a_program_that_is_another_one_by_now_is_refused(
     root: Path, tmp_path: Path, install: Install, this_host: Path
 ) -> None:
