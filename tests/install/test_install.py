@@ -101,6 +101,33 @@ def test_the_commands_show_write_and_remove_a_station(
     assert not (root / PROFILE).exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--containers", "OUT", "--dry-run"], ["--dry-run"]),
+        (["--containers", "OUT", "--rollback"], ["--rollback"]),
+        (["--containers", "OUT", "--root", "/mnt", "--replicas", "2"], ["--root", "--replicas"]),
+        (["--containers", "OUT", "--program", PROGRAM], ["--program"]),
+        (["--containers", "OUT", "--kubernetes", "OUT"], ["--containers"]),
+        (["--kubernetes", "OUT", "--dry-run", "--rollback"], ["--dry-run"]),
+        (["--kubernetes", "OUT", "--allow", "192.0.2.0/24"], ["--allow"]),
+        (["--kubernetes", "OUT", "--program", PROGRAM, "--root", "/mnt"], ["--program", "--root"]),
+        (["--replicas", "3"], ["--replicas"]),
+        (["--rollback", "--allow", "192.0.2.0/24"], ["--allow"]),
+    ],
+)
+def test_an_option_that_would_be_ignored_is_refused(
+    tmp_path: Path, profile: Path, options: list[str], named: list[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["install", str(profile), *(str(out) if one == "OUT" else one for one in options)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 2, done.output
+    for option in named:
+        assert option in done.output
+    assert not out.exists()
+
+
 def test_installed_profile_means_the_same_to_root_and_to_the_service(
     root: Path, install: Install
 ) -> None:
