@@ -63,12 +63,11 @@ def record_station(
     if duration_s:
         check_duration(duration_s, "--duration-s", most=LONGEST_S)
     from palpate_services.recorder.service import SERVICE, run_recorder
-    from palpate_services.recorder.writer import leftovers
+    from palpate_services.recorder.writer import RECOVERED, leftovers
 
     config = parse_config(RecorderConfig, {**EVERYTHING, **settings}, where="command line")
     check_room(config.out, config.min_free_bytes)
     Session.open(link, station=station).close()  # raises at once if there is no router
-    before = set(config.out.glob("*.mcap"))
     stop = stop_on_signals()
     if duration_s:
         timer = threading.Timer(duration_s, stop.set)
@@ -80,11 +79,12 @@ def record_station(
     own = f"{SERVICE}/{instance}"
     health = Health(SERVICE, instance)
     # Who waits for an end of his own choosing gets all; after a signal there is little time.
-    run_recorder(
+    opened = run_recorder(
         config, link, station, stop, instance=instance, health=health, write_all=duration_s > 0
     )
-    written = sorted(set(config.out.glob("*.mcap")) - before)
-    summaries = [print_contents(path) for path in written]
+    # One that the disk cut off may have been recovered.
+    written = [one for path in opened for one in (path, path.with_suffix(RECOVERED))]
+    summaries = [print_contents(path) for path in written if path.exists()]
     for part in leftovers(config.out):  # the disk refused its end, and no later one recovered it
         command = shlex.join(("palpate", "recover", str(part)))
         print(f"{printable(str(part))} is cut off; its whole messages: {printable(command)}")
