@@ -23,6 +23,7 @@ from palpate_deploy.demo.bundles import write_virtual_record
 from palpate_deploy.diagnose import records
 from palpate_services.config import RecorderConfig
 from palpate_services.recorder import service, writer
+from palpate_services.viewer import simulation
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -144,6 +145,19 @@ def test_record_refuses_a_disk_without_room_at_once(
         records.record_station(link, "lab", {"out": tmp_path / "runs"}, duration_s=1.0)
     assert "--out" in refused.value.remedy
     assert not (tmp_path / "runs").exists()
+
+
+def test_names_of_files_are_printed_without_control_characters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    view = tmp_path / "view.rrd"
+    view.touch()
+    monkeypatch.setattr(simulation, "review_simulations", lambda *_, **__: view)
+    monkeypatch.setattr(records, "_draw_store", lambda *_: None)
+    records._review_store(tmp_path, view, tmp_path / "red\x1b[31m.png", (), 8)
+    shown = capsys.readouterr().out
+    assert ".png" in shown
+    assert "\x1b" not in shown
 
 
 def test_truncated_record_is_refused_and_recovered(

@@ -320,7 +320,7 @@ def _review_store(
     print(f"{printable(str(written))}  ({written.stat().st_size / 1e6:.1f} MB)")
     if picture is not None:
         _draw_store(path, picture, trajectories)
-        print(picture)
+        print(printable(str(picture)))
     print(f"look at it: {viewer_command(written)}")
 
 
