@@ -22,15 +22,17 @@ import pytest
 from rich.console import Console
 
 import palpate_training
+from palpate.admin import make_token, token_file
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import FEATURES, WRENCH
 from palpate.config import LinkConfig
-from palpate.errors import BundleError, ConfigError, LinkError, StreamTimeout
+from palpate.errors import BundleError, ConfigError, LinkError, RecordingError, StreamTimeout
 from palpate.files.bundle import read_bundle, write_bundle
+from palpate.health import Health
 from palpate.messages import NO_TARE, QualityFlag
 from palpate_deploy.station import calibrate, guided_presses
 from palpate_deploy.station.guided_presses import HELD_S, PressCounter
-from palpate_services.config import RecorderConfig
+from palpate_services.config import ModelsConfig, RecorderConfig
 from palpate_services.inference.repository import resolve
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
@@ -218,6 +220,61 @@ def test_the_record_is_that_of_its_own_recorder(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lab-1.mcap", "lab-2.mcap"]
 
 
+def recording_of(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, *names: str, fails: bool = False
+) -> guided_presses._Recording:
+    """A recording that has ended, whose recorder wrote these files, and failed at the end."""
+
+    def run(config: RecorderConfig, *_: object, health: Health, **__: object) -> None:
+        config.out.mkdir(parents=True)
+        for name in names:
+            (config.out / name).touch()
+        if fails:
+            health.fail(RecordingError("the disk is full", remedy="free some space"))
+
+    monkeypatch.setattr(guided_presses, "run_recorder", run)
+    with guided_presses._recording(LinkConfig(), "lab", "finger", folder) as recording:
+        pass
+    return recording
+
+
+def test_a_recorder_that_pauses_ends_the_presses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is pressed while it pauses is lost."""
+    recording = recording_of(tmp_path, monkeypatch, "lab-1.mcap", fails=True)
+    for look in (recording.check, recording.path):
+        with pytest.raises(RecordingError, match="the disk is full") as told:
+            look()
+        assert "free some space" in told.value.remedy
+        assert f"{tmp_path} keeps what was recorded, for --from" in told.value.remedy
+
+
+def test_presses_of_two_records_are_not_halved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = recording_of(tmp_path, monkeypatch, "lab-1.mcap", "lab-2.mcap")
+    with pytest.raises(RecordingError, match=r"paused.*lab-1.mcap, .*lab-2.mcap") as told:
+        recording.path()
+    assert "--from" in told.value.remedy
+
+
+def test_nobody_presses_for_a_disk_without_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("palpate_services.recorder.writer.free_bytes", lambda _: 200_000_000)
+    with pytest.raises(RecordingError, match="200 MB free, a record needs 268 MB"):
+        guided_presses.record_presses(
+            LinkConfig(connect=("tcp/127.0.0.1:1",)),
+            "lab",
+            "finger",
+            7,
+            tmp_path,
+            Console(),
+            least=6,
+        )
+
+
 def test_a_signal_after_the_presses_ends_the_learning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -244,6 +301,27 @@ def test_a_record_of_another_finger_is_not_learned_from(
         calibrate.calibrate_finger(
             LinkConfig(), "lab", order, token=None, profile=None, as_json=True
         )
+
+
+@pytest.mark.parametrize(
+    ("serve", "problem"),
+    [(False, r"\[models\] folder: .* is no folder"), (True, "no service 'features' answers")],
+)
+def test_nobody_presses_for_a_bundle_that_cannot_be_kept_or_served(
+    link: LinkConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    serve: bool,
+    problem: str,
+) -> None:
+    if serve:
+        make_token(token_file(ModelsConfig().memory_folder, "lab"))
+    else:
+        (tmp_path / "data").touch()
+    monkeypatch.setattr(calibrate, "record_presses", lambda *_, **__: pytest.fail("pressed"))
+    order = calibrate.CalibrationOrder("finger", 7, tmp_path / "rec", None, "", serve=serve)
+    with pytest.raises((ConfigError, LinkError), match=problem):
+        calibrate.calibrate_finger(link, "lab", order, token=None, profile=None, as_json=True)
 
 
 def test_a_version_that_another_takes_meanwhile_is_left_to_it(

@@ -20,6 +20,7 @@ import typer
 from typer.testing import CliRunner
 
 from palpate.bus import Session
+from palpate.config import LinkConfig
 from palpate.errors import (
     BundleError,
     ConfigError,
@@ -33,8 +34,9 @@ from palpate.errors import (
 from palpate_deploy.cli import WIDE
 from palpate_deploy.cli import data as training
 from palpate_deploy.cli.app import app
+from palpate_deploy.cli.options import DEFAULT_CONNECT, DEFAULT_STATION
 from palpate_deploy.diagnose import doctor
-from palpate_deploy.station import tare
+from palpate_deploy.station import status, tare
 from palpate_deploy.station.host import check_free, free_endpoint
 from palpate_deploy.station.logs import exit_code
 from palpate_deploy.station.profile import changed, load_profile
@@ -267,6 +269,47 @@ def test_doctor_warns_of_sensors_that_no_gateway_has() -> None:
     assert fix
     alone = strange.model_copy(update={"processes": ("router", "gateway")})
     assert doctor._sensors(alone)[0] == "ok"
+
+
+@pytest.mark.parametrize(
+    ("given", "variables", "where"),
+    [
+        ([], {}, ("tcp/127.0.0.1:7555", "mine")),
+        (["--connect", DEFAULT_CONNECT], {}, (DEFAULT_CONNECT, "mine")),
+        (["--station", DEFAULT_STATION], {}, ("tcp/127.0.0.1:7555", DEFAULT_STATION)),
+        ([], {"PALPATE_CONNECT": DEFAULT_CONNECT}, (DEFAULT_CONNECT, "mine")),
+    ],
+)
+def test_what_is_given_beside_a_profile_holds(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    given: list[str],
+    variables: dict[str, str],
+    where: tuple[str, str],
+) -> None:
+    """Although it is what would hold without the profile."""
+    path = tmp_path / "mine.toml"
+    path.write_text('station = "mine"\n[router]\nlisten = ["tcp/127.0.0.1:7555"]\n', "utf-8")
+    asked = []
+
+    def show_status(link: LinkConfig, station: str, **_: object) -> int:
+        asked.append((*link.connect, station))
+        return 0
+
+    monkeypatch.setattr(status, "show_status", show_status)
+    for profile in (["--profile", str(path)], []):
+        done = CliRunner().invoke(app, ["status", *profile, *given], env=variables)
+        assert done.exit_code == 0, done.output
+    assert asked[0] == where
+    assert asked[1] == (DEFAULT_CONNECT, DEFAULT_STATION)
+
+
+def test_doctor_takes_the_folder_of_a_bag(tmp_path: Path) -> None:
+    """A bag of ROS 2 is one."""
+    for path, grade in ((tmp_path, "ok"), (tmp_path / "gone", "fail")):
+        sensor = {"name": "finger", "driver": "ros_bag", "options": {"path": str(path)}}
+        profile = changed(load_profile("virtual"), gateway={"sensors": [sensor]})
+        assert doctor._sensors(profile)[0] == grade
 
 
 def test_a_tare_over_many_frames_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:

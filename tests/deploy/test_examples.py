@@ -66,7 +66,7 @@ def station(
     with router() as link:
         stop = threading.Event()
         patient = {"max_age_s": LIVE_S}  # a host on which other tests run, too
-        parts: list[tuple[Callable[..., None], object]] = [
+        parts: list[tuple[Callable[..., object], object]] = [
             (gateway.run, sensors),
             (
                 functools.partial(run_estimating, models=models),

@@ -4,26 +4,38 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from palpate.bus import Session
 from palpate.bus.no_router import RouterAbsent
 from palpate.census import SUPERVISOR, ProcessReport
 from palpate.config import LinkConfig, endpoint_host_port
-from palpate.errors import ConfigError, LinkError
+from palpate.errors import ConfigError, DeviceLost, LinkError
+from palpate.health import Health, HealthReporter
+from palpate.messages import ServiceState, Status, SupervisedProcess
+from palpate.process import state_folder
 from palpate_deploy.station.host import (
+    KEPT_RUNS,
+    RUN_LOCK,
     free_endpoint,
     new_run_folder,
+    running_folders,
     write_profile,
     write_run_file,
 )
 from palpate_deploy.station.profile import parse_profile
+from palpate_deploy.station.status import show_status
 from palpate_deploy.station.troubles import (
+    Expectation,
     ask_through_router,
     expectation,
     expectation_here,
     expectation_of,
+    lifeless,
     troubles,
 )
 
@@ -69,13 +81,34 @@ def test_a_run_of_this_host_is_found_by_router_and_station() -> None:
 def test_the_newest_run_counts_and_one_that_has_ended_does_not() -> None:
     here = free_endpoint()
     ended = a_run(here)
-    ended.rename(ended.with_name(f"99999999-999999-mine-{2**22 + 5}"))
+    (ended / RUN_LOCK).unlink()
+    ended.rename(ended.with_name(f"99999999-999999-mine-{os.getpid()}"))
     assert expectation_here([here], "lab") is None
     finite = a_run(here, supervised=False)
     finite.rename(finite.with_name(f"20990101-000000-replay-{os.getpid()}"))
     said = expectation_here([here], "lab")
     assert said is not None
     assert said.processes == names()
+
+
+def test_folders_of_ended_runs_go_although_a_process_has_their_id() -> None:
+    """In a container every start has the same one."""
+    runs = state_folder() / "runs"
+    for number in range(2 * KEPT_RUNS):
+        (runs / f"20260101-{number:06d}-lab-{os.getpid()}").mkdir(parents=True)
+    running = new_run_folder("lab")
+    running = running.rename(runs / f"20250101-000000-lab-{2**22 + 5}")
+    other = runs / "0-somebody-elses"
+    other.mkdir()
+    for _ in range(2):
+        new_run_folder(f"lab{_}")
+    assert {running, other} < {*runs.iterdir()}
+    assert len([*runs.iterdir()]) == KEPT_RUNS + 2
+    assert running in running_folders()
+    made = "from palpate_deploy.station.host import new_run_folder; print(new_run_folder('lab'))"
+    done = subprocess.run([sys.executable, "-c", made], capture_output=True, text=True, check=True)
+    assert Path(done.stdout.strip()).is_dir()
+    assert Path(done.stdout.strip()) not in running_folders()
 
 
 def test_a_damaged_folder_is_passed_over() -> None:
@@ -147,6 +180,41 @@ def test_a_supervisor_that_hangs_is_missed_beside_a_named_profile() -> None:
     assert said is not None
     assert said.source == "profile virtual"
     assert said.processes == expectation_of("virtual").processes | {SUPERVISOR}
+
+
+def test_a_health_check_fails_only_for_what_is_missing_or_mute(
+    link: LinkConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A lost sensor is no reason to end the station that waits for it."""
+    profile = tmp_path / "lab.toml"
+    profile.write_text('processes = ["gateway"]\n', encoding="utf-8")
+    health = Health("gateway", "gateway")
+    with Session.open(link, station="lab") as session:
+        presence = session.presence("gateway", instance="gateway")
+        with HealthReporter(session, health):
+            presence.ready()
+            health.fail(DeviceLost("sensor 'thumb' is silent", remedy="plug it in"))
+            look = {"as_json": False, "profile": str(profile), "timeout_s": 1.0}
+            assert show_status(link, "lab", **look) == 1  # type: ignore[arg-type]
+            assert show_status(link, "lab", alive=True, **look) == 0  # type: ignore[arg-type]
+            assert capsys.readouterr().out.count("sensor 'thumb' is silent") >= 2, "it is told"
+            profile.write_text('processes = ["gateway", "recorder"]\n', encoding="utf-8")
+            assert show_status(link, "lab", alive=True, **look) == 1  # type: ignore[arg-type]
+
+
+def test_a_process_that_is_started_again_or_is_elsewhere_is_not_for_a_health_check() -> None:
+    gone = [ProcessReport(name, name, False, False, None) for name in ("web", "features", "fem")]
+    processes = (
+        SupervisedProcess("web", "web", "backoff", 0, 3, 0.0),
+        SupervisedProcess("features", "features", "starting", 4711, 0, 1.0),
+    )
+    state = ServiceState.DEGRADED
+    status = Status(*SUPERVISOR, state, 10**12, 0, 60.0, "1", processes=processes)
+    census = [*gone, ProcessReport(*SUPERVISOR, True, True, status)]
+    assert {one.service for one in troubles(census)} == {"web", "features", "fem", "supervisor"}
+    assert {one.service for one in lifeless(census)} == {"features", "fem"}
+    own = Expectation("profile lab", frozenset((name, name) for name in ("web", "features")))
+    assert {one.service for one in lifeless(census, own)} == {"features"}
 
 
 def test_a_full_disk_of_state_is_told_with_a_remedy() -> None:

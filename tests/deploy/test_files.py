@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,7 +21,9 @@ from palpate.files.record_writer import RecordWriter
 from palpate.health import Health
 from palpate_deploy.demo.bundles import write_virtual_record
 from palpate_deploy.diagnose import records
+from palpate_services.config import RecorderConfig
 from palpate_services.recorder import service, writer
+from palpate_services.viewer import simulation
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -97,13 +100,40 @@ def test_record_says_that_messages_never_came(
     out = tmp_path / "runs"
     out.mkdir()
 
-    def pause(*_: object, **__: object) -> None:
-        _without(virtual_record, out / "lab.mcap", range(100, 237))
+    def pause(*_: object, **__: object) -> list[Path]:
+        return [_without(virtual_record, out / "lab.mcap", range(100, 237))]
 
     monkeypatch.setattr(service, "run_recorder", pause)
     monkeypatch.setattr(records, "stop_on_signals", threading.Event)
     with pytest.raises(RecordingError, match="137 messages that were published never came"):
         records.record_station(link, "lab", {"out": out}, duration_s=1.0)
+
+
+def test_record_tells_of_its_own_record_alone(
+    link: LinkConfig,
+    virtual_record: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The station's recorder ends one in the same folder meanwhile."""
+    own: list[str] = []
+
+    def record(config: RecorderConfig, *more: Any, **options: Any) -> list[Path]:
+        shutil.copy(virtual_record, config.out / "the-stations.mcap")
+        paths = real(config, *more, **options)
+        own.extend(path.name for path in paths)
+        return paths
+
+    real = service.run_recorder
+    monkeypatch.setattr(service, "run_recorder", record)
+    monkeypatch.setattr(records, "stop_on_signals", threading.Event)
+    with pytest.raises(LinkError, match="nothing came of station 'lab'"):
+        records.record_station(link, "lab", {"out": tmp_path, "rrd": False}, duration_s=0.5)
+    shown = "".join(capsys.readouterr().out.split())
+    assert "the-stations" not in shown
+    assert len(own) == 1
+    assert own[0] in shown
 
 
 def test_record_refuses_a_disk_without_room_at_once(
@@ -115,6 +145,19 @@ def test_record_refuses_a_disk_without_room_at_once(
         records.record_station(link, "lab", {"out": tmp_path / "runs"}, duration_s=1.0)
     assert "--out" in refused.value.remedy
     assert not (tmp_path / "runs").exists()
+
+
+def test_names_of_files_are_printed_without_control_characters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    view = tmp_path / "view.rrd"
+    view.touch()
+    monkeypatch.setattr(simulation, "review_simulations", lambda *_, **__: view)
+    monkeypatch.setattr(records, "_draw_store", lambda *_: None)
+    records._review_store(tmp_path, view, tmp_path / "red\x1b[31m.png", (), 8)
+    shown = capsys.readouterr().out
+    assert ".png" in shown
+    assert "\x1b" not in shown
 
 
 def test_truncated_record_is_refused_and_recovered(
@@ -218,8 +261,9 @@ def test_record_says_that_its_folder_was_removed(
 def test_record_says_that_messages_are_lost(
     link: LinkConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, counter: str
 ) -> None:
-    def lose(*_: object, health: Health, **__: object) -> None:
+    def lose(*_: object, health: Health, **__: object) -> list[Path]:
         health.count(counter, 2478)
+        return []
 
     monkeypatch.setattr(service, "run_recorder", lose)
     monkeypatch.setattr(records, "stop_on_signals", threading.Event)
@@ -235,8 +279,9 @@ def test_record_names_what_is_cut_off(
 ) -> None:
     part = tmp_path / "lab-20261130T081327.448Z.mcap.part"
 
-    def fail(*_: object, **__: object) -> None:
+    def fail(*_: object, **__: object) -> list[Path]:
         part.write_bytes(bytes(2048))
+        return [part.with_suffix("")]
 
     monkeypatch.setattr(service, "run_recorder", fail)
     monkeypatch.setattr(records, "stop_on_signals", threading.Event)

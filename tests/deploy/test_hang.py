@@ -16,6 +16,8 @@ from palpate.bus.topics import FEATURES
 from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.process import state_folder
+from palpate_deploy.station import lifetime, supervision
+from palpate_deploy.station.host import private_profile
 from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import load_profile
 
@@ -97,6 +99,36 @@ def test_nobody_is_left_by_a_supervisor_that_hangs_or_is_killed(
     os.kill(pids["supervisord"], end)
     assert up.wait(timeout=2 * PATIENCE_S) == 1
     assert process_ids(tmp_path) == {}
+
+
+def test_one_late_answer_does_not_shorten_the_end(
+    monkeypatch: pytest.MonkeyPatch, wait_until: WaitUntil
+) -> None:
+    """Processes have their time to drain, unless supervisord is mute when they are to end."""
+    ends_s = []
+
+    def stop_child(process: subprocess.Popen[bytes], orderly_s: float) -> None:
+        ends_s.append(orderly_s)
+        lifetime.stop_child(process, orderly_s)
+
+    monkeypatch.setattr(supervision, "stop_child", stop_child)
+    monkeypatch.setattr(supervision, "_ANSWER_S", 0.5)
+    profile = private_profile("virtual").model_copy(update={"processes": ("router", "gateway")})
+    with supervision.Supervisor(profile, "late") as supervisor:
+
+        def answers() -> bool:
+            try:
+                return len(supervisor.processes()) == 2
+            except supervision.SupervisorError:
+                return False
+
+        os.kill(supervisor._process.pid, signal.SIGSTOP)
+        try:
+            assert not answers()
+        finally:
+            os.kill(supervisor._process.pid, signal.SIGCONT)
+        wait_until(answers, PATIENCE_S, "it answers again")
+    assert ends_s == [2 * supervision.STOP_WAIT_S + 5]
 
 
 def test_every_process_drains_and_ends_with_status_0(

@@ -33,7 +33,12 @@ from palpate.messages import (
     SupervisedProcess,
 )
 from palpate_deploy.station import observation
-from palpate_deploy.station.activity import DropCount, process_activities, sensor_activities
+from palpate_deploy.station.activity import (
+    DropCount,
+    process_activities,
+    sensor_activities,
+    sensor_part,
+)
 from palpate_deploy.station.observation import ObservedProcess, StationObserver
 from palpate_deploy.station.status import _print, show_status, shown_counters
 from palpate_deploy.station.tare import take_tare
@@ -166,6 +171,20 @@ def test_figures_of_every_sensor() -> None:
     assert thumb.state_age_s == pytest.approx(600.0)
     assert (ring.state, ring.tare_drift_counts, ring.message) == ("lost", 7.0, "silent for 40 ms")
     assert ring.tare_age_s is None
+
+
+def test_figures_of_a_process_are_not_those_of_its_only_sensor() -> None:
+    """A gateway with one sensor puts no name in front of its figures."""
+    status = dataclasses.replace(
+        GATEWAY,
+        counters={"silences": 3, "questions_refused_full": 2, "gauges_not_finite": 1},
+        sensor_states=GATEWAY.sensor_states[:1],
+    )
+    seen = [ObservedProcess(ProcessReport("gateway", "gateway", True, True, status))]
+    (gateway,), (thumb,) = process_activities(seen), sensor_activities(seen)
+    assert thumb.drops.keys() == {"silences"}
+    assert gateway.drops.keys() == {"questions_refused_full", "gauges_not_finite"}
+    assert sensor_part("waiting_questions", status) == ("", "waiting_questions")
 
 
 @pytest.mark.parametrize("width", [80, 160])

@@ -16,6 +16,7 @@ import pytest
 from supervisor.states import ProcessStates
 
 from palpate.heartbeat import FILE_VARIABLE, START_S, Pulse, read_pulse
+from palpate_deploy.station import watch
 from palpate_deploy.station.logs import FAILED, USAGE
 from palpate_deploy.station.watch import HangWatch, Silence, cannot_serve
 
@@ -169,6 +170,25 @@ def test_a_loop_that_hangs_is_killed_and_says_where(hanging: Callable[[int], _St
     assert str(station.child.pid) in line
     assert station.child.stderr is not None
     assert "a_driver_that_does_not_return" in station.child.stderr.read()
+
+
+def test_a_hang_that_passed_is_not_why_it_ends_later(
+    hanging: Callable[[int], _Station], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It goes on while it is being asked where it hangs, and is not killed."""
+    monkeypatch.setattr(watch, "_STACKS_S", PATIENCE_S)
+    station = hanging(1_000_000)
+    station.look_until(lambda: read_pulse(station.file) is not None)
+    os.kill(station.child.pid, signal.SIGSTOP)
+    station.look_until(lambda: bool(station.lines))
+    assert "hung: no heartbeat" in station.lines[0]
+    before = read_pulse(station.file)
+    os.kill(station.child.pid, signal.SIGCONT)
+    station.look_until(lambda: read_pulse(station.file) != before)
+    station.watch.look()
+    station.child.kill()
+    report = station.reap()
+    assert (report["hangs"], report["why"]) == (0, "ended by SIGKILL")
 
 
 def test_a_process_runs_from_its_first_beat(hanging: Callable[[int], _Station]) -> None:

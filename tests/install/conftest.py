@@ -62,14 +62,18 @@ def install(root: Path, profile: Path) -> Install:
 
 @pytest.fixture
 def this_host(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Let the system in the folder be this host, run by systemd; the file with what it was told."""
+    """Let the system in the folder be this host, run by systemd; the file with what it was told.
+
+    A file of that name with ``.fail`` makes the commands that it names fail; empty = all.
+    """
     told = tmp_path / "systemctl.log"
     told.touch()
     programs = tmp_path / "programs"
     programs.mkdir()
     for name in ("systemctl", "udevadm"):
         script = programs / name
-        script.write_text(f'#!/bin/sh\necho {name} "$@" >> {told}\n[ ! -e {told}.fail ]\n')
+        fails = f'[ -e {told}.fail ] && {{ [ ! -s {told}.fail ] || grep -qx "$1" {told}.fail; }}'
+        script.write_text(f'#!/bin/sh\necho {name} "$@" >> {told}\n! {{ {fails}; }}\n')
         script.chmod(0o755)
     monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
     monkeypatch.setattr("palpate_deploy.install.ledger.Host.is_this_host", True)

@@ -81,6 +81,11 @@ def test_compose_is_closed(case: str) -> None:
         assert "privileged" not in service
 
 
+def test_an_unplugged_finger_ends_no_station(case: str) -> None:
+    for service in _services(case).values():
+        assert service["healthcheck"]["test"][1:4] == ["palpate", "status", "--alive"]
+
+
 def test_quadlets_say_the_same_as_compose(case: str) -> None:
     files = container_files(plan_of_case(case), "", VERSION)
     for name, service in _services(case).items():

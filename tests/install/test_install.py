@@ -101,6 +101,33 @@ def test_the_commands_show_write_and_remove_a_station(
     assert not (root / PROFILE).exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--containers", "OUT", "--dry-run"], ["--dry-run"]),
+        (["--containers", "OUT", "--rollback"], ["--rollback"]),
+        (["--containers", "OUT", "--root", "/mnt", "--replicas", "2"], ["--root", "--replicas"]),
+        (["--containers", "OUT", "--program", PROGRAM], ["--program"]),
+        (["--containers", "OUT", "--kubernetes", "OUT"], ["--containers"]),
+        (["--kubernetes", "OUT", "--dry-run", "--rollback"], ["--dry-run"]),
+        (["--kubernetes", "OUT", "--allow", "192.0.2.0/24"], ["--allow"]),
+        (["--kubernetes", "OUT", "--program", PROGRAM, "--root", "/mnt"], ["--program", "--root"]),
+        (["--replicas", "3"], ["--replicas"]),
+        (["--rollback", "--allow", "192.0.2.0/24"], ["--allow"]),
+    ],
+)
+def test_an_option_that_would_be_ignored_is_refused(
+    tmp_path: Path, profile: Path, options: list[str], named: list[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["install", str(profile), *(str(out) if one == "OUT" else one for one in options)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 2, done.output
+    for option in named:
+        assert option in done.output
+    assert not out.exists()
+
+
 def test_installed_profile_means_the_same_to_root_and_to_the_service(
     root: Path, install: Install
 ) -> None:
@@ -602,6 +629,33 @@ def test_all_is_as_it_was_when_systemd_refuses(
     with pytest.raises(InstallError):
         service.uninstall("lab", root, purge=True)
     assert difference(installed, contents(root)) == []
+
+
+def test_a_unit_that_is_needed_no_more_is_stopped_when_all_else_is_done(
+    root: Path, tmp_path: Path, install: Install, this_host: Path
+) -> None:
+    profile = tmp_path / "lab.toml"
+    profile.write_text(PROFILES["elements"].replace("biotac_can", "virtual"), encoding="utf-8")
+    install()
+    before = contents(root)
+    profile.write_text(VIRTUAL, encoding="utf-8")
+    this_host.write_text("")
+    failing = Path(f"{this_host}.fail")
+    failing.write_text("enable\n")
+    with pytest.raises(InstallError, match="systemctl enable"):
+        install()
+    assert difference(before, contents(root)) == []
+    told = this_host.read_text()
+    assert "disable" not in told, "it still runs"
+    assert "daemon-reload" in told.partition("systemctl enable")[2], "systemd knows the old units"
+    failing.unlink()
+    this_host.write_text("")
+    install()
+    told = this_host.read_text()
+    stopped = "systemctl disable --now --quiet palpate-fem@lab.service"
+    assert stopped in told.partition("systemctl enable")[2]
+    assert "daemon-reload" in told.partition(stopped)[2], "systemd forgets it"
+    assert not (root / "etc/systemd/system/palpate-fem@lab.service").exists()
 
 
 def test_rollback_to_a_program_that_is_another_one_by_now_is_refused(

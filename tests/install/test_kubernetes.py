@@ -24,7 +24,7 @@ validate: Any = pytest.importorskip("kubernetes_validate")
 
 PROFILE = """
 station = "pool"
-processes = ["router", "fem", "metrics"]
+processes = ["router", "fem", "features"]
 
 [link]
 certificates = "/etc/palpate/certs"
@@ -79,7 +79,7 @@ def test_a_wrong_document_would_be_found(written: dict[str, list[dict[str, Any]]
 
 def test_no_pod_may_do_more_than_its_work(written: dict[str, list[dict[str, Any]]]) -> None:
     found = dict(pods(written))
-    assert sorted(found) == ["fem", "metrics", "router"]
+    assert sorted(found) == ["features", "fem", "router"]
     for name, pod in found.items():
         assert pod["securityContext"]["runAsNonRoot"] is True
         assert pod["securityContext"]["runAsUser"] > 0
@@ -123,8 +123,9 @@ def test_selectors_and_names_meet(written: dict[str, list[dict[str, Any]]]) -> N
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ('"fem", "metrics"', '"gateway"', "gateway cannot run in a cluster"),
-        ('["router", "fem", "metrics"]', '["fem"]', "router of its own"),
+        ('"fem", "features"', '"gateway"', "gateway cannot run in a cluster"),
+        ('"fem", "features"', '"metrics"', "metrics cannot run in a cluster"),
+        ('["router", "fem", "features"]', '["fem"]', "router of its own"),
         ('certificates = "/etc/palpate/certs"', "", "needs certificates"),
         ('listen = ["tls/127.0.0.1:7447", "tls/0.0.0.0:7447"]', 'listen = ["tls/127.0.0.1:7447"]',
          "loopback only"),

@@ -20,11 +20,13 @@ from palpate_deploy.cli.options import (
     DEFAULT_CONNECT,
     DEFAULT_PROFILE,
     DEFAULT_STATION,
+    ConnectElseOption,
     ConnectOption,
     JsonOption,
     PalpateGroup,
     ProfileOption,
     SensorOption,
+    StationElseOption,
     StationOption,
     TlsOption,
     WantedOption,
@@ -118,16 +120,22 @@ def run(
 @app.command(epilog=example("palpate status", "palpate status --profile virtual --json"))
 def status(
     profile: WantedOption = None,
-    connect: ConnectOption = DEFAULT_CONNECT,
+    alive: Annotated[
+        bool,
+        typer.Option(
+            "--alive", help="Fail only if one is missing or does not answer: for health checks."
+        ),
+    ] = False,
+    connect: ConnectElseOption = None,
     tls: TlsOption = None,
-    station: StationOption = DEFAULT_STATION,
+    station: StationElseOption = None,
     json_: JsonOption = False,
 ) -> None:
     """What should run at a station and what does; fails if anything is missing or not ready."""
     from palpate_deploy.station.status import show_status
 
     link, station = station_link(profile, connect, station, tls)
-    raise typer.Exit(show_status(link, station, as_json=json_, profile=profile))
+    raise typer.Exit(show_status(link, station, as_json=json_, profile=profile, alive=alive))
 
 
 @app.command(epilog=example("palpate top", "palpate top --once", "palpate top --json"))
@@ -135,9 +143,9 @@ def top(
     period_s: Annotated[float, typer.Option(min=0.1, help="Time between two pictures [s].")] = 1.0,
     once: Annotated[bool, typer.Option("--once", help="Print one picture and end.")] = False,
     profile: WantedOption = None,
-    connect: ConnectOption = DEFAULT_CONNECT,
+    connect: ConnectElseOption = None,
     tls: TlsOption = None,
-    station: StationOption = DEFAULT_STATION,
+    station: StationElseOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Rates, latencies, losses, memory of every process and sensor, live; q quits."""
@@ -242,9 +250,9 @@ def calibrate(
     ] = None,
     token: TokenOption = None,
     profile: StationProfileOption = None,
-    connect: ConnectOption = DEFAULT_CONNECT,
+    connect: ConnectElseOption = None,
     tls: TlsOption = None,
-    station: StationOption = DEFAULT_STATION,
+    station: StationElseOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Make a finger's own features bundle: guided presses against its force/torque sensor.

@@ -15,6 +15,14 @@ RootOption = Annotated[
     typer.Option(metavar="FOLDER", help="Root of the system: / = this host, else of an image."),
 ]
 
+_PODS = 2
+_IDLE_BESIDE = {
+    "--kubernetes": ("--containers", "--dry-run", "--rollback", "--allow", "--root", "--program"),
+    "--containers": ("--dry-run", "--rollback", "--root", "--program", "--replicas"),
+    "--rollback": ("--dry-run", "--allow", "--program"),
+}
+"""Options that would mean nothing beside each."""
+
 
 def install(
     profile: Annotated[
@@ -56,8 +64,11 @@ def install(
         ),
     ] = None,
     replicas: Annotated[
-        int, typer.Option(min=1, max=64, help="With --kubernetes: pods of each service.")
-    ] = 2,
+        int | None,
+        typer.Option(
+            min=1, max=64, help="With --kubernetes: pods of each service.", show_default=str(_PODS)
+        ),
+    ] = None,
     root: RootOption = Path("/"),
     program: Annotated[
         str,
@@ -73,15 +84,22 @@ def install(
     """
     from palpate_deploy.install.plan import InstallOrder
 
-    if dry_run and rollback:
-        raise ConfigError(
-            "--dry-run shows what an install would write, not a roll-back",
-            remedy="leave out one of them; a second --rollback undoes the first",
-        )
+    _check_options(
+        {
+            "--allow": bool(allow),
+            "--dry-run": dry_run,
+            "--rollback": rollback,
+            "--containers": containers is not None,
+            "--kubernetes": kubernetes is not None,
+            "--replicas": replicas is not None,
+            "--root": root != Path("/"),
+            "--program": bool(program),
+        }
+    )
     if kubernetes is not None:
         from palpate_deploy.install.kubernetes import write_manifests
 
-        write_manifests(profile, kubernetes, name=name, replicas=replicas)
+        write_manifests(profile, kubernetes, name=name, replicas=replicas or _PODS)
         return
     order = InstallOrder(profile, name, root, program, tuple(allow or ()))
     if containers is not None:
@@ -97,6 +115,24 @@ def install(
         service.roll_back(order.station, root)
     else:
         service.install(order)
+
+
+def _check_options(given: dict[str, bool]) -> None:
+    """Refuse options that mean nothing beside the others: whoever gives them expects something.
+
+    Raises:
+        ConfigError: There are some.
+    """
+    for option, others in _IDLE_BESIDE.items():
+        if given[option] and (idle := [other for other in others if given[other]]):
+            raise ConfigError(
+                f"{option} takes no {', '.join(idle)}", remedy="leave out one or the other"
+            )
+    if given["--replicas"] and not given["--kubernetes"]:
+        raise ConfigError(
+            "--replicas is of manifests for a cluster only",
+            remedy="leave it out, or give --kubernetes FOLDER",
+        )
 
 
 def uninstall(

@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from palpate_deploy.cli.options import (
-    DEFAULT_CONNECT,
     DEFAULT_PROFILE,
-    DEFAULT_STATION,
-    ConnectOption,
+    ConnectElseOption,
     JsonOption,
     ProfileOption,
-    StationOption,
+    StationElseOption,
     TlsOption,
     example,
     group,
@@ -121,9 +119,9 @@ def served(
     service: ServiceOption = None,
     token: TokenOption = None,
     profile: StationProfileOption = None,
-    connect: ConnectOption = DEFAULT_CONNECT,
+    connect: ConnectElseOption = None,
     tls: TlsOption = None,
-    station: StationOption = DEFAULT_STATION,
+    station: StationElseOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Which bundle serves which sensor, and what a roll back would serve."""
@@ -141,9 +139,9 @@ def load(
     service: ServiceOption = None,
     token: TokenOption = None,
     profile: StationProfileOption = None,
-    connect: ConnectOption = DEFAULT_CONNECT,
+    connect: ConnectElseOption = None,
     tls: TlsOption = None,
-    station: StationOption = DEFAULT_STATION,
+    station: StationElseOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Serve another bundle of the repository, without losing a frame."""
@@ -169,9 +167,9 @@ def unload(
     service: ServiceOption = None,
     token: TokenOption = None,
     profile: StationProfileOption = None,
-    connect: ConnectOption = DEFAULT_CONNECT,
+    connect: ConnectElseOption = None,
     tls: TlsOption = None,
-    station: StationOption = DEFAULT_STATION,
+    station: StationElseOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Serve no bundle any more; a sensor then has the bundle of all others again."""
@@ -187,9 +185,9 @@ def rollback(
     service: ServiceOption = None,
     token: TokenOption = None,
     profile: StationProfileOption = None,
-    connect: ConnectOption = DEFAULT_CONNECT,
+    connect: ConnectElseOption = None,
     tls: TlsOption = None,
-    station: StationOption = DEFAULT_STATION,
+    station: StationElseOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Serve again what served before the last change; a second time undoes the first."""
@@ -204,9 +202,9 @@ def _change(
     service: str | None,
     token: Path | None,
     profile: str | None,
-    connect: str,
+    connect: str | None,
     tls: Path | None,
-    station: str,
+    station: str | None,
     *,
     bundle: str = "",
     sensor: str = "",

@@ -15,6 +15,9 @@ from palpate_deploy.station.logs import exit_code, print_error
 if TYPE_CHECKING:
     from palpate.config import LinkConfig, TlsConfig
 
+DEFAULT_CONNECT = "tcp/127.0.0.1:7447"  # as palpate.config.DEFAULT_ROUTER, whose import is slow
+DEFAULT_STATION = "lab"
+
 ProfileOption = Annotated[
     str, typer.Option("--profile", "-p", metavar="NAME|FILE", help="A profile by name or path.")
 ]
@@ -36,6 +39,26 @@ ConnectOption = Annotated[
 StationOption = Annotated[
     str, typer.Option("--station", envvar="PALPATE_STATION", help="Name of the station.")
 ]
+ConnectElseOption = Annotated[
+    str | None,
+    typer.Option(
+        "--connect",
+        metavar="ENDPOINT",
+        envvar="PALPATE_CONNECT",
+        help="The station's router.",
+        show_default=f"of the profile, else {DEFAULT_CONNECT}",
+    ),
+]
+"""As ``ConnectOption``, beside ``--profile``: what is given holds, be it the default."""
+StationElseOption = Annotated[
+    str | None,
+    typer.Option(
+        "--station",
+        envvar="PALPATE_STATION",
+        help="Name of the station.",
+        show_default=f"of the profile, else {DEFAULT_STATION}",
+    ),
+]
 TlsOption = Annotated[
     Path | None,
     typer.Option(
@@ -48,8 +71,6 @@ TlsOption = Annotated[
 SensorOption = Annotated[str, typer.Option("--sensor", help="Name of a sensor; * = all.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 
-DEFAULT_CONNECT = "tcp/127.0.0.1:7447"  # as palpate.config.DEFAULT_ROUTER, whose import is slow
-DEFAULT_STATION = "lab"
 DEFAULT_PROFILE = "virtual"
 ROUTER_WAIT_S = 2.0
 """How long a command waits for the station's router [s]."""
@@ -94,11 +115,12 @@ def client_link(connect: str, tls: TlsConfig | Path | None = None) -> LinkConfig
 
 
 def station_link(
-    profile: str | None, connect: str, station: str, tls: Path | None = None
+    profile: str | None, connect: str | None, station: str | None, tls: Path | None = None
 ) -> tuple[LinkConfig, str]:
-    """Link and name of a station: those of a profile where the options have their defaults."""
+    """Link and name of a station: those of a profile where they are not given."""
     if profile is None:
-        return client_link(connect, tls), station
+        connect = DEFAULT_CONNECT if connect is None else connect
+        return client_link(connect, tls), DEFAULT_STATION if station is None else station
     from palpate.config import Role, TlsConfig
     from palpate_deploy.station.profile import load_profile
 
@@ -108,9 +130,9 @@ def station_link(
         link = link.model_copy(update={"tls": TlsConfig.of_folder(tls), "certificates": None})
     link = link.as_role(Role.OPERATOR)
     link = link.model_copy(update={"wait_for_router_s": ROUTER_WAIT_S})
-    if connect != DEFAULT_CONNECT:
+    if connect is not None:
         link = client_link(connect, tls or (link.tls if connect.startswith("tls/") else None))
-    return link, loaded.station if station == DEFAULT_STATION else station
+    return link, loaded.station if station is None else station
 
 
 def existing_file(path: Path, *, or_folder: bool = False) -> Path:

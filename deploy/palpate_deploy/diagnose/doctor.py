@@ -136,7 +136,7 @@ def _sensors(profile: Profile) -> Found:
     for sensor in profile.gateway.sensors:
         make_device(sensor.driver, sensor.options, where=f"options of sensor {sensor.name!r}")
         path = sensor.options.get("path")
-        if path is not None and not Path(str(path)).is_file():
+        if path is not None and not Path(str(path)).exists():  # a bag may be a folder
             return "fail", f"sensor {sensor.name!r}: {path} does not exist", "set its path"
         names.append(f"{sensor.name} ({sensor.driver})")
     found = ", ".join(names)

@@ -25,6 +25,7 @@ from palpate.files.outputs import check_output
 from palpate.files.record import RecordSummary, check_readable, recover, summarise
 from palpate.health import Health
 from palpate.process import stop_on_signals
+from palpate_deploy.station.host import check_room
 from palpate_deploy.station.logs import cell
 from palpate_deploy.station.status import duration_text
 
@@ -62,12 +63,11 @@ def record_station(
     if duration_s:
         check_duration(duration_s, "--duration-s", most=LONGEST_S)
     from palpate_services.recorder.service import SERVICE, run_recorder
-    from palpate_services.recorder.writer import leftovers
+    from palpate_services.recorder.writer import RECOVERED, leftovers
 
     config = parse_config(RecorderConfig, {**EVERYTHING, **settings}, where="command line")
-    _check_room(config.out, config.min_free_bytes)
+    check_room(config.out, config.min_free_bytes)
     Session.open(link, station=station).close()  # raises at once if there is no router
-    before = set(config.out.glob("*.mcap"))
     stop = stop_on_signals()
     if duration_s:
         timer = threading.Timer(duration_s, stop.set)
@@ -79,11 +79,12 @@ def record_station(
     own = f"{SERVICE}/{instance}"
     health = Health(SERVICE, instance)
     # Who waits for an end of his own choosing gets all; after a signal there is little time.
-    run_recorder(
+    opened = run_recorder(
         config, link, station, stop, instance=instance, health=health, write_all=duration_s > 0
     )
-    written = sorted(set(config.out.glob("*.mcap")) - before)
-    summaries = [print_contents(path) for path in written]
+    # One that the disk cut off may have been recovered.
+    written = [one for path in opened for one in (path, path.with_suffix(RECOVERED))]
+    summaries = [print_contents(path) for path in written if path.exists()]
     for part in leftovers(config.out):  # the disk refused its end, and no later one recovered it
         command = shlex.join(("palpate", "recover", str(part)))
         print(f"{printable(str(part))} is cut off; its whole messages: {printable(command)}")
@@ -119,19 +120,6 @@ def record_station(
     if all(key.sensor == own for key in keys):  # its status
         raise LinkError(
             f"nothing came of station {station!r}", remedy="see what runs: palpate status"
-        )
-
-
-def _check_room(out: Path, least: int) -> None:
-    """Refuse a disk on which the recorder would pause from its first message on."""
-    from palpate_services.recorder.writer import free_bytes
-
-    folder = out.absolute()
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    if (free := free_bytes(existing)) < least:
-        raise RecordingError(
-            f"{out} has {free / 1e6:,.0f} MB free, a record needs {least / 1e6:,.0f} MB",
-            remedy="free some space, or record to a folder on another disk: --out",
         )
 
 
@@ -332,7 +320,7 @@ def _review_store(
     print(f"{printable(str(written))}  ({written.stat().st_size / 1e6:.1f} MB)")
     if picture is not None:
         _draw_store(path, picture, trajectories)
-        print(picture)
+        print(printable(str(picture)))
     print(f"look at it: {viewer_command(written)}")
 
 

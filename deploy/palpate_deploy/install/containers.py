@@ -74,7 +74,8 @@ def _containers(plan: ServicePlan) -> list[_Container]:
                 writable={name: place},
                 devices=() if solver else plan.needs.serial,
                 gpu=solver and plan.needs.gpu,
-                check=("palpate", "status", "--profile", file),
+                # Not whether all is well: no new start of the station plugs a finger in.
+                check=("palpate", "status", "--alive", "--profile", file),
             )
         )
     return made
@@ -219,7 +220,7 @@ def _quadlet(plan: ServicePlan, one: _Container, image: str) -> str:
         *([f"GroupAdd={_DIALOUT}"] if one.devices else []),
         *(f"AddDevice=-{line}" for line in one.devices),
         *(["# Not tried with a GPU.", "AddDevice=nvidia.com/gpu=all"] if one.gpu else []),
-        "# Up when everything is ready; a station that hangs is killed, and started again below.",
+        "# Up when everything answers; a station that hangs is killed, and started again below.",
         "Notify=healthy",
         f"HealthCmd={shlex.join(one.check)}",
         "HealthInterval=30s",

@@ -20,8 +20,8 @@ from palpate_deploy.install.units import FEM
 from palpate_deploy.station.processes import check_packages, role_of
 from palpate_deploy.station.profile import Profile, Service, parse_profile, profile_path, read_toml
 
-CLUSTERED = frozenset({"router", "fem", "features", "field", "synthesis", "metrics"})
-"""Processes that may run in a cluster."""
+CLUSTERED = frozenset({"router", "fem", "features", "field", "synthesis"})
+"""Processes that may run in a cluster; ``metrics`` is served on loopback, where nobody reads it."""
 
 _CERTIFICATES = "/etc/palpate/certs"
 _PROFILE = "/etc/palpate/profile"
@@ -87,8 +87,8 @@ def manifests(profile: Profile, text: str, name: str, *, replicas: int) -> dict[
 def _check(profile: Profile) -> None:
     if strange := [one for one in profile.processes if one not in CLUSTERED]:
         raise ConfigError(
-            f"{', '.join(strange)} cannot run in a cluster: sensors, recordings and pages belong "
-            "to a PC of the lab",
+            f"{', '.join(strange)} cannot run in a cluster: sensors, recordings, pages and "
+            "metrics belong to a PC of the lab",
             remedy=f"write a profile with some of {', '.join(sorted(CLUSTERED))}; the stations "
             "connect up to its router: [router] connect",
         )
@@ -166,13 +166,13 @@ def _replicas(name: str, service: str, replicas: int) -> list[dict[str, Any]]:
     labels = _labels(name, service)
     own = f"{name}-{service}"
     spec = {
-        "replicas": 1 if service == "metrics" else replicas,
+        "replicas": replicas,
         "selector": {"matchLabels": labels},
         "strategy": {"type": "RollingUpdate", "rollingUpdate": {"maxUnavailable": 1}},
         "template": {"metadata": {"labels": labels}},
     }
     made = [_object("apps/v1", "Deployment", own, name, service=service, spec=spec)]
-    if replicas > 1 and service != "metrics":
+    if replicas > 1:
         budget = {"minAvailable": 1, "selector": {"matchLabels": labels}}
         made.append(
             _object("policy/v1", "PodDisruptionBudget", own, name, service=service, spec=budget)
@@ -217,7 +217,7 @@ def _pod(profile: Profile, name: str, service: Service, port: int) -> dict[str, 
         {"name": "PALPATE_LINK__CONNECT", "value": json.dumps([connect])},
         {"name": "_PALPATE_HEARTBEAT", "value": f"{_BEATS}/{service}"},
     ]
-    if service not in ("router", "metrics"):
+    if service != "router":
         name_of_pod = {"fieldRef": {"fieldPath": "metadata.name"}}
         environment.append({"name": "PALPATE_REPLICA", "valueFrom": name_of_pod})
     memory_mb = _MEMORY_MB.get(service, _SERVICE_MEMORY_MB)

@@ -308,7 +308,8 @@ class Books:
         """Write everything of ``ledger.now``; remove what was installed and is not in it.
 
         Nothing is asked: what a person has changed is overwritten. ``then`` is called before the
-        change counts as made. After an error, also one of ``then``, all is as it was.
+        change counts as made, while what shall go is still there. After an error, also one of
+        ``then``, all files are as they were.
 
         Raises:
             OSError: The disk is full, or something cannot be written.
@@ -332,9 +333,9 @@ class Books:
             staged = {path: _stage(self.host.at(path), text) for path, text in texts.items()}
             for path, temporary in staged.items():
                 temporary.replace(self.host.at(path))
+            then()
             for path in gone:
                 self.host.at(path).unlink(missing_ok=True)
-            then()
             self.keep(ledger)
             self._journal.unlink()
         except BaseException:

@@ -202,11 +202,19 @@ def _change(books: Books, ledger: Ledger, enable: str) -> None:
 
     def tell_systemd() -> None:
         _reload(host)
-        _stop(host, [Path(path).name for path in gone if path.endswith(".service")])
         if enable and host.is_running:
             _systemctl("enable", "--quiet", enable)
+        # Last: the undoing of a change starts nothing again.
+        _stop(host, [Path(path).name for path in gone if path.endswith(".service")])
 
-    books.change(ledger, tell_systemd)
+    try:
+        books.change(ledger, tell_systemd)
+    except BaseException:
+        with contextlib.suppress(InstallError):  # the first error tells more
+            _reload(host)
+        raise
+    if gone:
+        _reload(host)
     for path in now.texts:
         print(f"wrote   {path}")
     for path in gone:
@@ -350,7 +358,7 @@ def _systemctl(*words: str) -> None:
     if done.returncode:
         raise InstallError(
             f"systemctl {' '.join(words)}: {done.stderr.strip() or done.returncode}",
-            remedy="see what it says; nothing has been changed",
+            remedy="see what it says, then give the same command again",
         )
 
 
@@ -382,6 +390,6 @@ def _errors_translated() -> Iterator[None]:
     except OSError as error:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         raise InstallError(
-            f"{error.filename or 'a file'}: {error.strerror or error}; all is as it was",
+            f"{error.filename or 'a file'}: {error.strerror or error}",
             remedy="make room on the disk" if full else "check rights and what lies there",
         ) from error

@@ -16,6 +16,8 @@ _QUANTILE = re.compile(r"(.+)_p(50|99)_s")
 _IN = frozenset({"frames_received", "fields_received", "received"})
 _OUT = frozenset({"frames_published", "estimates_published", "simulations_complete"})
 _WRITTEN = "recorded_"
+_OF_PROCESS = ("wall_", "process_", "questions_", "waiting_questions", "gauges_not_finite")
+"""Begins of the names of figures that are of a gateway, and of no sensor of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +145,7 @@ def sensor_part(name: str, status: Status) -> tuple[str, str]:
     sensor, dot, rest = name.rpartition(".")
     if dot:
         return sensor, rest
-    if len(status.sensor_states) == 1 and not name.startswith(("wall_", "process_")):
+    if len(status.sensor_states) == 1 and not name.startswith(_OF_PROCESS):
         return status.sensor_states[0].name, name
     return "", name
 

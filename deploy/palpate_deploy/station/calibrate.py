@@ -27,6 +27,7 @@ from palpate.client.models import ModelAdmin
 from palpate.config import LinkConfig
 from palpate.errors import BundleError, ConfigError
 from palpate.files.bundle import read_bundle, write_bundle
+from palpate.files.outputs import check_folder
 from palpate.process import check_installed
 from palpate_deploy.station.guided_presses import record_presses, untouched
 from palpate_deploy.station.profile import Profile
@@ -169,11 +170,13 @@ def calibrate_finger(
     ``token`` None is that of the station, as the ``profile`` or the default says where.
 
     Raises:
-        LinkError: There is no router, or no such finger, or no force sensor for it.
+        LinkError: There is no router, or no such finger, or no force sensor for it, or no service
+            to serve the bundle.
         DatasetError: Too few presses.
         BundleError: The bundle cannot be written.
-        ConfigError: The order contradicts itself or the files that it names, or its folder cannot
-            be written.
+        ConfigError: The order contradicts itself or the files that it names, or its folder or that
+            of the bundles cannot be written.
+        RemoteError: The token is not the station's.
         KeyboardInterrupt: It was interrupted before there were presses enough.
         MissingExtraError: The training extra is not installed.
     """
@@ -189,8 +192,11 @@ def calibrate_finger(
     secret = b""
     if order.presses and order.source is None:
         _check_writable(order.out)
+    check_folder(kept.repository_folder, "[models] folder")
     if order.serve:
         secret = read_token(token_file(kept.memory_folder, station) if token is None else token)
+        with Session.open(link, station=station) as session:
+            ModelAdmin(session, secret).served("features")
     source = order.source
     if order.presses == 0:
         tare = untouched(link, station, order.sensor, console)

@@ -21,11 +21,13 @@ from palpate.bus import Delivery, Session
 from palpate.bus.topics import ELECTRODES, WRENCH, Topic
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import LinkError, RecordingError, StreamTimeout
-from palpate.messages import NO_TARE, ElectrodeFrame, Tare
+from palpate.health import Health
+from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
 from palpate.process import stop_on_signals
+from palpate_deploy.station.host import check_room
 from palpate_deploy.station.tare import tare_at_rest
 from palpate_services.config import EVERYTHING, RecorderConfig
-from palpate_services.recorder.service import run_recorder
+from palpate_services.recorder.service import SERVICE, run_recorder
 
 Message = TypeVar("Message")
 
@@ -136,9 +138,10 @@ def record_presses(
         LinkError: There is no router, or no such finger, or no force sensor for it.
         RemoteError: The gateway takes no tare.
         StreamTimeout: A stream ends, or the finger is not let go.
-        RecordingError: The record cannot be written.
+        RecordingError: The disk has no room, or the record cannot be written or has holes.
         KeyboardInterrupt: It was interrupted before ``least`` presses.
     """
+    check_room(out, RecorderConfig().min_free_bytes)
     count = 0
     with _until_recorded() as interrupted, Session.open(link, station=station) as session:
         serial = _first(session, ELECTRODES, sensor, _NO_ELECTRODES).sensor_serial
@@ -190,13 +193,15 @@ class _Recording:
 
     Attributes:
         folder: What it writes to.
+        health: Of the recorder.
         failure: What ended it before its time; None = nothing.
     """
 
     def __init__(self, out: Path) -> None:
         self._out = out
         self._records: list[Path] = []
-        self.folder = out / f"calibrate-{os.getpid()}"
+        self.health = Health(SERVICE, f"calibrate-{os.getpid()}")
+        self.folder = out / self.health.instance
         self.failure: BaseException | None = None
 
     def close(self) -> None:
@@ -218,9 +223,16 @@ class _Recording:
             ) from error
 
     def check(self) -> None:
-        """Raise what ended it: nobody shall press for nothing."""
+        """Raise what ended it, or what it loses messages by: nobody shall press for nothing."""
         if self.failure is not None:
             raise self.failure
+        if self.health.state is ServiceState.DEGRADED:
+            error = self.health.status().last_error
+            assert error is not None, "it says why"
+            raise RecordingError(
+                error.message,
+                remedy=f"{error.remedy}; {self._out} keeps what was recorded, for --from",
+            )
 
     @property
     def record(self) -> Path | None:
@@ -228,15 +240,21 @@ class _Recording:
         return self._records[-1] if self._records else None
 
     def path(self) -> Path:
-        """The finished record, which must be there.
+        """The finished record, which must be there and hold every press.
 
         Raises:
-            RecordingError: There is none.
+            RecordingError: There is none, or it has holes.
         """
         self.check()
         if self.record is None:
             raise RecordingError(
                 f"no record was written to {self._out}", remedy="check the disk's free space"
+            )
+        if len(self._records) > 1:
+            names = ", ".join(map(str, self._records))
+            raise RecordingError(
+                f"the recorder paused, and presses are missing between its records: {names}",
+                remedy="press again, or learn from one of them: --from",
             )
         return self.record
 
@@ -256,7 +274,8 @@ def _recording(link: LinkConfig, station: str, sensor: str, out: Path) -> Iterat
 
     def run() -> None:
         try:
-            run_recorder(config, link, station, stop, instance=f"calibrate-{os.getpid()}")
+            health = recording.health
+            run_recorder(config, link, station, stop, instance=health.instance, health=health)
         except BaseException as error:
             recording.failure = error
 

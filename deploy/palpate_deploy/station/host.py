@@ -1,8 +1,9 @@
-"""What a run needs of this host: free ports, and a folder for its profile and logs."""
+"""What a run needs of this host: free ports, room on a disk, a folder for its profile and logs."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import shutil
 import socket
@@ -15,7 +16,7 @@ import tomli_w
 
 from palpate.bus import Session
 from palpate.config import Role, endpoint_host_port
-from palpate.errors import ConfigError, LinkError
+from palpate.errors import ConfigError, LinkError, RecordingError
 from palpate.process import state_folder
 from palpate_deploy.station.profile import Profile, changed, load_profile, plain_values
 
@@ -45,6 +46,23 @@ def check_free(endpoints: Iterable[str]) -> None:
                 f"the router cannot listen at {endpoint}: {error.strerror or error}",
                 remedy="set [router] listen to an address of this host",
             ) from error
+
+
+def check_room(out: Path, least: int) -> None:
+    """Check that a recorder, which pauses below ``least`` free bytes, can write to a folder.
+
+    Raises:
+        RecordingError: It would pause from its first message on.
+    """
+    from palpate_services.recorder.writer import free_bytes  # slow to import
+
+    folder = out.absolute()
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if (free := free_bytes(existing)) < least:
+        raise RecordingError(
+            f"{out} has {free / 1e6:,.0f} MB free, a record needs {least / 1e6:,.0f} MB",
+            remedy="free some space, or record to a folder on another disk: --out",
+        )
 
 
 def free_endpoint() -> str:
@@ -95,6 +113,10 @@ KEPT_RUNS = 20
 """Older folders are removed; records are never stored there."""
 
 
+RUN_LOCK = "running"
+"""File in the folder of a run that its process holds locked: another one may have its id later."""
+
+
 def new_run_folder(name: str) -> Path:
     """Make an empty folder for a run, and remove those of the oldest runs.
 
@@ -106,6 +128,8 @@ def new_run_folder(name: str) -> Path:
     folder = runs / f"{stamp}-{name}-{os.getpid()}"
     try:
         (folder / "logs").mkdir(parents=True, mode=0o700)
+        # Never closed: the kernel gives the lock back when this process ends, however it does.
+        fcntl.flock(os.open(folder / RUN_LOCK, os.O_CREAT | os.O_WRONLY, 0o600), fcntl.LOCK_EX)
     except OSError as error:
         raise ConfigError(
             f"run folder {folder} cannot be made: {error.strerror or error}",
@@ -134,16 +158,14 @@ def run_pid(folder: Path) -> int:
 
 def _in_use(folder: Path) -> bool:
     """Whether the process that made a run's folder still runs."""
-    pid = run_pid(folder)
-    if not pid:
-        return True  # made by something else
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
+        with open(folder / RUN_LOCK, "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return not run_pid(folder)  # made by something else
+    except OSError:
         return True
-    return True
+    return False
 
 
 def write_profile(profile: Profile, folder: Path) -> Path:

@@ -133,7 +133,7 @@ def _run(service: Service, profile: Profile, link: LinkConfig, stop: threading.E
     run(table, link, profile.station, stop, instance=instance)
 
 
-def _entry_point(service: Service, profile: Profile) -> Callable[..., None]:
+def _entry_point(service: Service, profile: Profile) -> Callable[..., object]:
     """The function that runs a service, of which only its own room is imported."""
     if service == "gateway":
         from palpate_gateway.service import node as gateway

@@ -27,6 +27,7 @@ from palpate_deploy.station.troubles import (
     Trouble,
     ask_through_router,
     expectation,
+    lifeless,
     process_name,
     troubles,
 )
@@ -150,6 +151,7 @@ def show_status(
     *,
     as_json: bool,
     profile: str | None = None,
+    alive: bool = False,
     timeout_s: float = PATIENCE_S,
 ) -> int:
     """Print what should run at a station and what does, with its status.
@@ -159,7 +161,8 @@ def show_status(
     ``timeout_s`` [s].
 
     Returns:
-        0; 1 if no process runs, or one is missing, does not answer or is not ready.
+        0; 1 if no process runs, or one is missing, does not answer or is not ready. With ``alive``
+        one that answers is well whatever it says: see ``troubles.lifeless``.
 
     Raises:
         LinkError: There is no router.
@@ -181,7 +184,8 @@ def show_status(
         _print(Console(), station, source, census, found)
         if nothing:
             print(printable(nothing))
-    return FAILED if found or not census else 0
+    wrong = lifeless(census, said) if alive else found
+    return FAILED if wrong or not census else 0
 
 
 def _print(

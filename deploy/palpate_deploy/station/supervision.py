@@ -138,6 +138,7 @@ class Supervisor:
                 f"supervisord does not answer: {error}",
                 remedy=f"see {self.logs / 'supervisord.log'}; start again with `palpate up`",
             ) from error
+        self._mute = False
         states = (
             ProcessState(
                 service=info.pop("name"),

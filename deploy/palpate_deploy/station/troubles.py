@@ -170,6 +170,23 @@ def troubles(census: Iterable[ProcessReport], said: Expectation | None = None) -
     return found
 
 
+def lifeless(census: Iterable[ProcessReport], said: Expectation | None = None) -> list[Trouble]:
+    """Those of the troubles that a new start of the station may end: missing or mute processes.
+
+    Of what ``said`` names, where that is known: another process may be of another host. One that
+    its supervisor has started again is left to it.
+    """
+    reports = list(census)
+    mute = {(one.service, one.instance) for one in reports if one.status is None}
+    for report in reports:
+        for one in () if report.status is None else report.status.processes:
+            if one.restarts and one.state != RUNNING:
+                mute.discard((one.service, one.instance))
+    if said is not None:
+        mute &= said.processes
+    return [one for one in troubles(reports, said) if (one.service, one.instance) in mute]
+
+
 def process_name(service: str, instance: str) -> str:
     """Name of a process for people: the instance only where there may be several."""
     return service if instance == service else f"{service}/{instance}"

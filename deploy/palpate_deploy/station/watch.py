@@ -116,6 +116,8 @@ class HangWatch:
                     self._let_it_stop(process, watched)
                 elif watched.silence.hangs:
                     self._end(process, watched, now_s)
+                else:
+                    watched.hung = ""
 
     def ended(self, process: Any, wait_status: int) -> None:
         """A process has ended; call it before supervisord takes notice."""

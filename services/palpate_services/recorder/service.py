@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from palpate.bus import Delivery, Session, Tap
@@ -41,12 +42,15 @@ def run_recorder(
     instance: str = "recorder",
     health: Health | None = None,
     write_all: bool = False,
-) -> None:
+) -> list[Path]:
     """Record until ``stop`` is set; then write the samples that have arrived and close the files.
 
     The arguments are those of ``run_estimating``; ``health`` receives state and counters, None = it
     makes its own. ``write_all``: However long it takes; else those are counted as lost for which
     ``drain_s`` leaves no time.
+
+    Returns:
+        The records, in the order in which they were begun; one may not have been finished.
 
     Raises:
         ConfigError: An unknown topic, or a bundle that does not exist.
@@ -87,6 +91,7 @@ def run_recorder(
                 tap.close()
                 _count_the_rest(tap, health)
                 files.close()
+    return files.opened
 
 
 class QueueReport:

@@ -215,6 +215,8 @@ class RecordFiles:
         self._health = health
         self._counts: Counter[str] = Counter()
         self._path = config.out
+        self.opened: list[Path] = []
+        """The records that were begun, in this order; each has its name when it has ended."""
         self._writer: RecordWriter | None = None
         self._view: LiveView | None = None
         self._views: list[LiveView] = []  # the present one, and earlier ones that are not finished
@@ -421,6 +423,7 @@ class RecordFiles:
             self._view = LiveView(plan)
             self._views.append(self._view)
         self._path = path
+        self.opened.append(path)
         self._say_ready()
         self._counts["records_opened"] += 1
         _log.info("recording to %s", path)
