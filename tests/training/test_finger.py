@@ -184,6 +184,19 @@ def test_a_recording_without_presses_counts_its_blocks(press_data: MakeData) -> 
     np.testing.assert_array_equal(touched, known.force.any(axis=1))
 
 
+@pytest.mark.parametrize("presses", [100, 240, 300, 700])
+def test_many_presses_are_learned_from_as_a_whole(press_data: MakeData, presses: int) -> None:
+    """Not from their ends, which are light touches, and never from too many rows."""
+    data = press_data(presses=presses)
+    known, touched = known_rows(data)
+    assert len(known) <= finger.ROWS_MOST
+    assert len(np.unique(known.press[touched])) >= min(presses, 150)
+    strength = np.linalg.norm(known.force[touched], axis=1)
+    assert 0.4 < np.mean(strength >= 2.0) < 0.8  # of all touched rows: 0.66
+    estimate = estimate_of(finger.ForceLine(known), data.tared_counts.astype(np.float64))
+    assert np.median(np.linalg.norm(estimate - data.force, axis=1)) < 0.05
+
+
 def test_few_presses_are_refused(press_data: MakeData, tmp_path: Path) -> None:
     data = press_data(presses=5)
     with pytest.raises(DatasetError, match=r"5 presses of at least 0\.5 N; 6 are needed"):

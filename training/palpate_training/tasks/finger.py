@@ -33,7 +33,14 @@ from palpate_training.learning.force_process import (
     KnownRows,
 )
 from palpate_training.learning.graphs import FeaturesGraph
-from palpate_training.learning.intervals import LEVEL, bounds, fit_formulas, terms_of, widened
+from palpate_training.learning.intervals import (
+    LEVEL,
+    bounds,
+    fit_formulas,
+    staggered,
+    terms_of,
+    widened,
+)
 from palpate_training.learning.metrics import force_errors, force_metrics
 from palpate_training.learning.other_fingers import OtherFinger, OtherFingers, SharedForce
 from palpate_training.learning.ranges import ends_of, known_inputs
@@ -51,6 +58,10 @@ PRESS_N = 0.5
 
 ROWS_MOST = 600
 """Rows that are fitted to; neighbours say nearly the same, and an estimate costs time for each."""
+
+ROWS_OF_PRESS_LEAST = 8
+"""Of so many of each press the first and the last are kept; of fewer these would be too large a
+share: they are the lightest touches."""
 
 UNTOUCHED_SHARE = 0.2
 """Share of them that is untouched, where the data has such rows."""
@@ -387,7 +398,12 @@ def known_rows(data: FeatureDataset) -> tuple[KnownRows, npt.NDArray[np.bool_]]:
     untouched = np.flatnonzero(~touched & np.isin(press, [press[piece[0]] for piece in pieces]))
     free = min(len(untouched), int(UNTOUCHED_SHARE * ROWS_MOST))
     each = (ROWS_MOST - free) // len(pieces)
-    kept = np.sort(np.concatenate([_evenly(untouched, free), *(_evenly(p, each) for p in pieces)]))
+    dealt = (
+        [_evenly(piece, each) for piece in pieces]
+        if each >= ROWS_OF_PRESS_LEAST
+        else [staggered(pieces, ROWS_MOST - free)]
+    )
+    kept = np.sort(np.concatenate([_evenly(untouched, free), *dealt]))
     rows = KnownRows(
         data.tared_counts[kept].astype(np.float64), data.force[kept].astype(np.float64), press[kept]
     )
@@ -395,7 +411,6 @@ def known_rows(data: FeatureDataset) -> tuple[KnownRows, npt.NDArray[np.bool_]]:
 
 
 def _evenly(rows: Rows, count: int) -> Rows:
-    count = max(1, count) if len(rows) else 0
     kept: Rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int))]
     return kept
 
