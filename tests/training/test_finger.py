@@ -17,6 +17,7 @@ from palpate.files.bundle import read_bundle
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import FeatureDataset
+from palpate_training.datasets.ingest import TOUCH_N
 from palpate_training.learning.force_process import Floats, ForceProcesses, KnownRows
 from palpate_training.learning.told_finger import ToldFinger
 from palpate_training.learning.twin_line import read_line
@@ -181,7 +182,26 @@ def test_a_recording_without_presses_counts_its_blocks(press_data: MakeData) -> 
     )
     known, touched = known_rows(rows)
     assert len(np.unique(known.press)) == 8
-    np.testing.assert_array_equal(touched, known.force.any(axis=1))
+    np.testing.assert_array_equal(touched, np.linalg.norm(known.force, axis=1) > TOUCH_N)
+
+
+def test_noise_of_the_force_sensor_is_no_touch(press_data: MakeData) -> None:
+    """Where nothing says what is touched, as in a table, the same rows are learned from."""
+    data = press_data(presses=12, rows=200)
+    assert data.in_contact is not None
+    idle = np.sort(np.r_[np.arange(len(data)), np.repeat(np.flatnonzero(~data.in_contact), 20)])
+    noise = np.random.default_rng(1).normal(0.0, 0.03, (len(idle), 3)).astype(np.float32)
+    columns = {name: values[idle] for name, values in data.arrays().items()}
+    told = replace(data, **columns | {"force": data.force[idle] + noise})
+    untold = replace(
+        told, in_contact=None, contact_location=None, centre_of_pressure=None, contact_normal=None
+    )
+    pressed = []
+    for one in (told, untold):
+        known, touched = known_rows(one)
+        assert 0.15 < np.mean(~touched) < 0.25
+        pressed.append(np.count_nonzero(np.linalg.norm(known.force, axis=1) >= 0.5))
+    assert pressed[1] >= 0.95 * pressed[0] > 100
 
 
 @pytest.mark.parametrize("presses", [100, 240, 300, 700])

@@ -25,6 +25,7 @@ from palpate.errors import DatasetError
 from palpate.files.intervals import BoundFormula, Intervals
 from palpate.messages import TrainingRange
 from palpate_training.datasets.features import FeatureDataset, check_learnable
+from palpate_training.datasets.ingest import TOUCH_N
 from palpate_training.learning.export import export_features, refuse_existing
 from palpate_training.learning.force_process import (
     LOCALITIES,
@@ -75,9 +76,6 @@ CHOICES = 3
 _DEVIATIONS = 1.6449
 """``LEVEL`` of the errors shall lie within so many standard deviations, as of a normal
 distribution."""
-
-_THRESHOLD_UNKNOWN_N = 0.2
-"""Where no row is untouched: above the noise of a six-axis sensor [N]."""
 
 _GOLDEN_ROWS = 64
 
@@ -252,7 +250,7 @@ class HeldOutPresses:
         return cls(
             metrics,
             force_sd,
-            threshold_above(untouched_n) if len(untouched_n) else _THRESHOLD_UNKNOWN_N,
+            threshold_above(untouched_n) if len(untouched_n) else TOUCH_N,
             finger_formulas(estimate[touched], truth, press, follow=follow),
             len(np.unique(press)),
         )
@@ -381,7 +379,7 @@ def known_rows(data: FeatureDataset) -> tuple[KnownRows, npt.NDArray[np.bool_]]:
             remedy="calibrate one finger at a time",
         )
     magnitude = np.linalg.norm(data.force, axis=1)
-    touched = magnitude > 0.0 if data.in_contact is None else data.in_contact
+    touched = data.touching(TOUCH_N)
     press = data.group if len(np.unique(data.group)) >= PRESSES_LEAST else data.block
     pieces: list[Rows] = [
         piece
