@@ -25,7 +25,7 @@ from palpate.errors import DatasetError
 from palpate.files.intervals import BoundFormula, Intervals
 from palpate.messages import TrainingRange
 from palpate_training.datasets.features import FeatureDataset, check_learnable
-from palpate_training.datasets.ingest import TOUCH_N
+from palpate_training.datasets.ingest import PRESS_N, TOUCH_N
 from palpate_training.learning.export import export_features, refuse_existing
 from palpate_training.learning.force_process import (
     LOCALITIES,
@@ -53,9 +53,6 @@ Rows = npt.NDArray[np.integer]
 
 PRESSES_LEAST = 6
 """Fewer presses cannot be held out and chosen on at once."""
-
-PRESS_N = 0.5
-"""What does not reach this force is no press [N]."""
 
 ROWS_MOST = 600
 """Rows that are fitted to; neighbours say nearly the same, and an estimate costs time for each."""
