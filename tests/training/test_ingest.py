@@ -345,7 +345,7 @@ def test_presses_end_halfway() -> None:
     ("touching", "presses"),
     [
         ("X..x...X", "00001111"),  # as without it
-        ("X..x...X", "00001111"),  # not cut in two
+        ("X.xxx..X", "00000111"),  # not cut in two
         ("X..xxx.X", "00011111"),
         ("x.X.....Xx.x", "000001111111"),
         ("x..x", "0000"),
