@@ -208,6 +208,7 @@ def test_a_single_function_splits_rows_at_random() -> None:
         "last_part",
         "name_of_units",
         "of_units",
+        "press_kind",
         "replace",
         "rows_at_random",
         "rows_of_part",

@@ -35,6 +35,7 @@ from palpate_training.evaluation.experiments import ExperimentSource
 from palpate_training.evaluation.features import paper_weights, weighted_median
 from palpate_training.evaluation.page import PAPER_LABEL, tables_of, write_pages
 from palpate_training.evaluation.study import Study, StudyPlan, write_study
+from palpate_training.figures.statistics import angled_share
 from palpate_training.systems import ours
 
 SIMPLE = ("zero", "training mean", "ridge")
@@ -57,6 +58,25 @@ def made(data: ExperimentDataset, folder: Path, **plan: Any) -> dict[str, Any]:
     study = Study(ExperimentSource(data, None), StudyPlan(systems=SIMPLE, **plan))
     study.make(folder, workers=0)
     return study.results(folder)
+
+
+def test_what_published_names_do_not_tell_is_left_out(
+    data: ExperimentDataset, tmp_path: Path
+) -> None:
+    """Neither points nor kinds of presses; nor are presses at random angled ones."""
+    named = {
+        "published": tuple(f"{data.indenters[k]}/{k}" for k in range(len(data.trajectories))),
+        "random": tuple(f"cube/{k:05d}/random" for k in range(len(data.trajectories))),
+    }
+    for name, trajectories in named.items():
+        other = replace(data, trajectories=trajectories)
+        assert np.isnan(angled_share(trajectories))
+        values = made(other, tmp_path / name, tasks=("location",))
+        splits = {row["split"] for row in values["scores"]}
+        assert ("point" in splits) == (name == "random")
+        for row in values["scores"]:
+            for kind in ("normal", "angled"):
+                assert np.isnan(row["metrics"][f"distance_m_median_{kind}_presses"])
 
 
 def test_every_cell_of_every_split_is_filled(data: ExperimentDataset, tmp_path: Path) -> None:
