@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -116,12 +118,51 @@ def test_code_that_a_system_builds_on_is_in_its_name(
     assert cells.code_of(system) != before
 
 
-def test_what_was_made_before_a_failure_is_kept(tmp_path: Path) -> None:
-    task = replace(NoiseTask(), systems=(Sometimes("drawn", True), Sometimes("broken", False)))
-    each = list(cells_of(task, [FOLD], [0, 1]))
+@pytest.mark.parametrize("workers", [0, 2])
+def test_the_others_are_made_where_one_fails(
+    tmp_path: Path, workers: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    task = replace(NoiseTask(), systems=(Sometimes("broken", False), Sometimes("drawn", True)))
+    each = list(cells_of(task, [FOLD], [0, 1, 2]))
     with pytest.raises(DatasetError, match="this one fails"):
-        make_cells([task], each, tmp_path, workers=0, on_cell=lambda *_: None)
-    assert [cell_path(tmp_path, task, cell).exists() for cell in each] == [True, True, False]
+        make_cells([task], each, tmp_path, workers=workers, on_cell=lambda *_: None)
+    made = [cell_path(tmp_path, task, cell).exists() for cell in each]
+    assert made == [False, True, True, True]
+    (told,) = caplog.messages
+    assert told.startswith("noise: broken, trajectory all units, seed 0: this one fails")
+
+
+@dataclass(frozen=True)
+class SlowTask(NoiseTask):
+    """Takes a while, leaves a file for each training that began, and gives what Ctrl-C does."""
+
+    systems: tuple[Sometimes, ...] = (Sometimes("drawn", True),)
+    begun: Path = Path()
+
+    def fit_and_test(self, system: Any, rows: RowSplit, seed: int) -> dict[str, Any]:
+        (self.begun / str(seed)).touch()
+        time.sleep(0.2 + 0.3 * (seed % 2))
+        return {"ignored": np.array(signal.getsignal(signal.SIGINT) == signal.SIG_IGN)}
+
+
+def test_on_ctrl_c_nothing_begins_and_what_is_under_way_is_kept(tmp_path: Path) -> None:
+    task = SlowTask(begun=tmp_path / "begun")
+    task.begun.mkdir()
+    each = list(cells_of(task, [FOLD], range(8)))
+    kept: list[Cell] = []
+
+    def on_cell(cell: Cell, _: bool) -> None:
+        kept.append(cell)
+        if len(kept) == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_cells([task], each, tmp_path, workers=2, on_cell=on_cell)
+    begun = {int(path.name) for path in task.begun.iterdir()}
+    paths = {cell.seed: cell_path(tmp_path, task, cell) for cell in each}
+    assert {seed for seed, path in paths.items() if path.exists()} == begun
+    assert len(begun) <= 2
+    assert all(read_cell(paths[seed]).arrays["ignored"] for seed in begun)
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:

@@ -10,14 +10,17 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 import multiprocessing
 import os
+import signal
 import sys
 import time
 import zipfile
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import cache, partial
 from multiprocessing.sharedctypes import Synchronized
@@ -29,11 +32,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from palpate.cluster import WorkerLostError
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate.files.hdf5 import add_array
 from palpate_training.experiment.generate.workers import end_with_parent
 from palpate_training.learning.splits import Fold, RowSplit
+
+_log = logging.getLogger(__name__)
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -206,9 +212,13 @@ def make_cells(
 
     Networks are trained on ``device``, as torch calls it; with ``cuda`` the processes take turns
     among the GPUs that there are. ``on_cell`` is told each cell, and whether it had to be made.
+    A training that fails is logged, and the others go on. Whatever ends this early, Ctrl-C too,
+    those under way are waited for and kept.
 
     Raises:
         DatasetError: The disk refuses.
+        WorkerLostError: A process died, e.g. because memory ran out.
+        Exception: What the first training that failed raised, once all others are kept.
     """
     by_name = {task.name: task for task in tasks}
     left = []
@@ -217,47 +227,77 @@ def make_cells(
             on_cell(cell, False)
         else:
             left.append(cell)
+    failed: list[Exception] = []
+
+    def finish(cell: Cell, made: Callable[[], bytes]) -> None:
+        try:
+            content = made()
+        except BrokenProcessPool:
+            raise
+        except Exception as error:  # of any library that a system is made with
+            test = f"{cell.fold.split} {cell.fold.test} {cell.fold.part}".rstrip()
+            _log.warning("%s: %s, %s, seed %d: %s", cell.task, cell.system, test, cell.seed, error)
+            failed.append(error)
+            return
+        _keep(folder, by_name[cell.task], cell, content)
+        on_cell(cell, True)
+
     if workers == 0:
         for cell in left:
             with torch.device(device):
-                content = _made(by_name[cell.task], cell)
-            _keep(folder, by_name[cell.task], cell, content)
-            on_cell(cell, True)
-        return
+                finish(cell, partial(_made, by_name[cell.task], cell))
+    else:
+        _make_in_processes(by_name, left, workers, device, finish)
+    if failed:
+        raise failed[0]
+
+
+def _make_in_processes(
+    tasks: dict[str, Task],
+    cells: Sequence[Cell],
+    workers: int,
+    device: str,
+    finish: Callable[[Cell, Callable[[], bytes]], None],
+) -> None:
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        min(workers, max(1, len(left))),
+    pool = ProcessPoolExecutor(
+        min(workers, max(1, len(cells))),
         mp_context=context,
         initializer=_take_tasks,
-        initargs=(by_name, device, context.Value("i", 0)),
-    ) as pool:
-        waiting = iter(left)
-        running: dict[Future[bytes], Cell] = {}
-        # A few at a time, so that what is asked for does not lie in memory for all cells.
-        for cell in waiting:
+        initargs=(tasks, device, context.Value("i", 0)),
+    )
+    running: dict[Future[bytes], Cell] = {}
+
+    def finish_some() -> None:
+        for done in wait(running, return_when=FIRST_COMPLETED).done:
+            finish(running[done], done.result)
+            del running[done]
+
+    try:
+        # One a process, so that nothing that was asked for is still to begin when this ends.
+        for cell in cells:
             running[pool.submit(_work, cell)] = cell
-            if len(running) >= 2 * workers:
-                _finish_some(running, folder, by_name, on_cell)
+            if len(running) >= workers:
+                finish_some()
         while running:
-            _finish_some(running, folder, by_name, on_cell)
-
-
-def _finish_some(
-    running: dict[Future[bytes], Cell],
-    folder: Path,
-    tasks: dict[str, Task],
-    on_cell: Callable[[Cell, bool], None],
-) -> None:
-    for done in wait(running, return_when=FIRST_COMPLETED).done:
-        cell = running.pop(done)
-        _keep(folder, tasks[cell.task], cell, done.result())
-        on_cell(cell, True)
+            finish_some()
+    except BrokenProcessPool as error:
+        raise WorkerLostError(
+            "a worker process died", remedy="give it more memory, or use fewer workers"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+        for future, cell in running.items():
+            if not future.cancelled() and future.exception() is None:
+                finish(cell, future.result)
 
 
 _tasks: dict[str, Task] = {}
 
 
 def _take_tasks(tasks: dict[str, Task], device: str, begun: Synchronized[int]) -> None:
+    # Ctrl-C is for the command, which keeps what is under way.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     os.nice(5)  # so that the machine stays usable during a night's work
     if device == "cuda":
