@@ -22,6 +22,13 @@ from palpate_training.evaluation.cells import (
     make_cells,
     read_cell,
 )
+from palpate_training.experiment.generate.trials import TrialsDone, pack, read_trials
+from palpate_training.learning.population_net import (
+    PopulationConfig,
+    PopulationNet,
+    load_population_net,
+    save_population_net,
+)
 from palpate_training.learning.splits import Fold, RowSplit
 from palpate_training.systems.fields import FIELD_SYSTEMS
 from palpate_training.systems.statistical import STATISTICAL
@@ -169,5 +176,50 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "cell.npz"
     for content in (b"", b"PK\x03\x04 no archive"):
         path.write_bytes(content)
-        with pytest.raises(DatasetError, match=r"cell\.npz is damaged"):
+        with pytest.raises(DatasetError, match=r"cell\.npz: not a readable"):
             read_cell(path)
+    np.savez(path, estimate=np.zeros(3))
+    with pytest.raises(DatasetError, match="seconds"):
+        read_cell(path)
+
+
+def _cell(path: Path) -> None:
+    np.savez_compressed(path, estimate=VALUES, seconds=np.array(1.0))
+
+
+def _trials(path: Path) -> None:
+    counts = {"biotac-1": VALUES}
+    path.write_bytes(pack(TrialsDone("cell", (), (("biotac-2", "why"),), counts, 5)))
+
+
+def _net(path: Path) -> None:
+    save_population_net(path, PopulationNet(("force",), PopulationConfig(width=16, blocks=1)))
+
+
+VALUES = np.round(np.random.default_rng(0).normal(size=(300, 19)), 2)
+
+
+@pytest.mark.parametrize(
+    ("write", "read"),
+    [
+        (_cell, read_cell),
+        (_trials, lambda path: read_trials(path.parent, "cell")),
+        (_net, load_population_net),
+    ],
+)
+def test_no_damage_of_an_archive_goes_untold(
+    tmp_path: Path, write: Callable[[Path], None], read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "cell.npz"
+    write(path)
+    whole = path.read_bytes()
+    told = []
+    arrays = whole.index(b"PK\x01\x02")  # what follows is the list of them
+    for at in range(40, arrays, max(37, arrays // 400)):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :])
+        try:
+            read(path)  # a byte of a time stamp, say
+        except DatasetError as error:
+            told.append("cell.npz" in error.problem)
+    assert len(told) > 20
+    assert all(told)

@@ -16,7 +16,6 @@ import os
 import signal
 import sys
 import time
-import zipfile
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -36,6 +35,7 @@ from palpate.cluster import WorkerLostError
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate.files.hdf5 import add_array
+from palpate_training.datasets.container import read_archive
 from palpate_training.experiment.generate.workers import end_with_parent
 from palpate_training.learning.splits import Fold, RowSplit
 
@@ -189,14 +189,12 @@ def read_cell(path: Path) -> CellResult:
     Raises:
         DatasetError: The file is damaged; names it.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        return CellResult(arrays, float(arrays.pop("seconds")))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise DatasetError(
-            f"{path} is damaged: {error}", remedy="remove it and run the command again"
-        ) from error
+    arrays = read_archive(
+        path,
+        lambda held: dict.fromkeys([*held, "seconds"]),
+        remedy="remove it and run the command again",
+    )
+    return CellResult(arrays, float(arrays.pop("seconds")))
 
 
 def make_cells(
