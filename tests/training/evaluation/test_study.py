@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
@@ -181,11 +182,22 @@ def test_a_study_that_holds_nothing_says_what_there_is(data: ExperimentDataset) 
         Study(ExperimentSource(data, None), StudyPlan(tasks=("field",)))
 
 
+@pytest.mark.parametrize("device", ["gpu", "cuda"])
+def test_a_device_that_is_not_there_is_told_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    words = ["report", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--device", device]
+    result = CliRunner().invoke(train_app, words)
+    assert isinstance(result.exception, ConfigError)
+    assert "no device 'gpu'" in str(result.exception) or "no GPU" in str(result.exception)
+
+
 def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_path: Path) -> None:
     write_experiment(tmp_path / "experiment.h5", data)
     options: dict[str, Any] = {
         "data": tmp_path, "out": tmp_path / "out", "tasks": "force", "splits": "trajectory",
-        "systems": "zero, ridge", "seeds": 1, "whole": True, "workers": 2, "device": "cpu",
+        "systems": "zero, ridge", "seeds": 1, "whole": True, "workers": 2, "device": "auto",
         "cells": None, "so_far": False,
     }  # fmt: skip
     with pytest.raises(ConfigError, match="holds no finished training"):
