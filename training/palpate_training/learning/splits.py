@@ -119,6 +119,9 @@ def unseen_sensor(
 
     Sensor and block are those of every row, shape ``(N,)``. Each tenth block of the others
     validates; rows beside it are left out.
+
+    Raises:
+        DatasetError: It is no sensor or the only one, or the others leave nothing to train on.
     """
     test = sensor == test_sensor
     if not test.any() or test.all():
@@ -128,7 +131,14 @@ def unseen_sensor(
         )
     seen = np.unique(block[~test])
     validation = np.isin(block, seen[2::10] if len(seen) > 2 else seen[-1:]) & ~test
-    return _guarded(validation, test, sensor, guard_rows)
+    split = _guarded(validation, test, sensor, guard_rows)
+    if not (len(split.train) and len(split.validation)):
+        raise DatasetError(
+            f"the other sensors have {len(seen)} blocks, of which a guard of {guard_rows} rows leaves"
+            " nothing to train or validate on",
+            remedy="cut their recordings into more blocks, or use longer recordings",
+        )
+    return split
 
 
 HELD_OUT_MOST = 1000
