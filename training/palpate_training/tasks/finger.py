@@ -182,7 +182,7 @@ def train_finger(
         said,
         estimator=estimator,
         source=source,
-        held_out_as="each press held out in its turn",
+        held_out_as=f"presses held out in {FOLDS} parts",
         data_sha256=data.content_sha256(),
         contact_sd=told.contact_sd if told else None,
         normalisation={"of a contact": f"of the network; errors are those on {told.source}"}
