@@ -1,8 +1,9 @@
 """One cell of a table: a system, trained on the rows of a fold from a seed, tested on the others.
 
-Cells are kept in a folder, each in a file named by a hash of all that decides it: the data, the
-rows of each side, the seed and the code of the system. So a run that was killed goes on where it
-was, and what has changed is made again. The work is spread over processes.
+Cells are kept in a folder, each in a file named by a hash of what decides it: the data, the rows
+of each side, the seed and the code of the system (`cell_key` says what is left out). So a run that
+was killed goes on where it was, and what has changed is made again. The work is spread over
+processes.
 """
 
 from __future__ import annotations
@@ -137,7 +138,11 @@ def cells_of(task: Task, folds: Iterable[Fold], seeds: Sequence[int]) -> Iterato
 
 
 def cell_key(task: Task, cell: Cell) -> str:
-    """Hash of all that decides a cell, hex."""
+    """Hash of the data, the rows, the seed, the system and its code in this package, hex.
+
+    What else may change results does not make kept ones anew: the device, the versions of the
+    libraries, and ``palpate`` itself, whose places of the electrodes many systems read.
+    """
     digest = hashlib.sha256()
     facts = [task.name, task.data_sha256, cell.system, cell.seed, code_of(_system(task, cell))]
     digest.update(json.dumps(facts).encode())
