@@ -18,7 +18,12 @@ from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import FeatureDataset
 from palpate_training.datasets.ingest import TOUCH_N
-from palpate_training.learning.force_process import Floats, ForceProcesses, KnownRows
+from palpate_training.learning.force_process import (
+    Floats,
+    ForceLine,
+    ForceProcesses,
+    KnownRows,
+)
 from palpate_training.learning.told_finger import ToldFinger
 from palpate_training.learning.twin_line import read_line
 from palpate_training.tasks import finger
@@ -213,7 +218,7 @@ def test_many_presses_are_learned_from_as_a_whole(press_data: MakeData, presses:
     assert len(np.unique(known.press[touched])) >= min(presses, 150)
     strength = np.linalg.norm(known.force[touched], axis=1)
     assert 0.4 < np.mean(strength >= 2.0) < 0.8  # of all touched rows: 0.66
-    estimate = estimate_of(finger.ForceLine(known), data.tared_counts.astype(np.float64))
+    estimate = estimate_of(ForceLine(known), data.tared_counts.astype(np.float64))
     assert np.median(np.linalg.norm(estimate - data.force, axis=1)) < 0.05
 
 

@@ -86,7 +86,7 @@ def staggered(presses: Sequence[Labels], count: int) -> Labels:
         presses: The rows of each press, in order of time; may be more than ``count``.
         count: Rows in all.
     """
-    press = np.arange(count) * len(presses) // count
+    press = (np.arange(count) * len(presses) // count).tolist()
     # Multiples of the golden ratio fall evenly into an interval, however many are taken, and any
     # few in a row lie far apart.
     part = np.arange(count) * GOLDEN_RATIO % 1.0

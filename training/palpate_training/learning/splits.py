@@ -134,8 +134,8 @@ def unseen_sensor(
     split = _guarded(validation, test, sensor, guard_rows)
     if not (len(split.train) and len(split.validation)):
         raise DatasetError(
-            f"the other sensors have {len(seen)} blocks, of which a guard of {guard_rows} rows leaves"
-            " nothing to train or validate on",
+            f"the other sensors have {len(seen)} blocks, of which a guard of {guard_rows} rows"
+            " leaves nothing to train or validate on",
             remedy="cut their recordings into more blocks, or use longer recordings",
         )
     return split
