@@ -29,7 +29,7 @@ from palpate.files.bundle import read_bundle
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import NOMINAL_PERIOD_S, FeatureDataset
-from palpate_training.datasets.ingest import ingest_lasa
+from palpate_training.datasets.ingest import PRESS_N, ingest_lasa
 from palpate_training.evaluation.transfer import (
     PRESS_S,
     Finger,
@@ -51,7 +51,6 @@ from palpate_training.tasks.finger import (
     ESTIMATORS,
     LIKE_OTHERS,
     LIKE_SIMULATED,
-    PRESS_N,
     ROWS_MOST,
     TOLD,
     chosen,

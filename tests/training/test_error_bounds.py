@@ -75,6 +75,30 @@ def test_of_many_presses_some_rows_are_enough(monkeypatch: pytest.MonkeyPatch) -
     assert 0.87 < covered(new_errors, bounds(formula, new_terms), new_press) < 0.93
 
 
+@pytest.mark.parametrize("most", [150, 300, 600])
+def test_of_more_presses_than_rows_each_part_is_seen(
+    monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    """Presses begin and end with light touches: these alone tell nothing of hard ones."""
+    errors, terms, press = _presses(8, 300)
+    order = np.lexsort((terms[:, 1], press)).reshape(300, 40)
+    ramps = np.hstack([order[:, ::2], order[:, ::-2]]).ravel()  # up and down
+    seen: list[int] = []
+
+    def counted(cost: Floats, **given: Any) -> Any:
+        seen.append(len(given["b_eq"]))
+        return linprog(cost, **given)
+
+    monkeypatch.setattr(intervals, "linprog", counted)
+    monkeypatch.setattr(intervals, "ROWS_MOST", most)
+    formula = fit_formula("force", errors[ramps], terms[ramps], press)
+    assert max(seen) <= most
+    new_errors, new_terms, new_press = _presses(1008, 400)
+    hard = new_terms[:, 1] > np.log1p(5.0)
+    held = covered(new_errors[hard], bounds(formula, new_terms[hard]), new_press[hard])
+    assert 0.85 < held < 0.95
+
+
 def test_bounds_follow_the_errors() -> None:
     errors, terms, press = _presses(3, 60)
     formula = fit_formula("force", errors, terms, press)

@@ -17,7 +17,13 @@ from palpate.files.bundle import read_bundle
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import FeatureDataset
-from palpate_training.learning.force_process import Floats, ForceProcesses, KnownRows
+from palpate_training.datasets.ingest import TOUCH_N
+from palpate_training.learning.force_process import (
+    Floats,
+    ForceLine,
+    ForceProcesses,
+    KnownRows,
+)
 from palpate_training.learning.told_finger import ToldFinger
 from palpate_training.learning.twin_line import read_line
 from palpate_training.tasks import finger
@@ -181,7 +187,39 @@ def test_a_recording_without_presses_counts_its_blocks(press_data: MakeData) -> 
     )
     known, touched = known_rows(rows)
     assert len(np.unique(known.press)) == 8
-    np.testing.assert_array_equal(touched, known.force.any(axis=1))
+    np.testing.assert_array_equal(touched, np.linalg.norm(known.force, axis=1) > TOUCH_N)
+
+
+def test_noise_of_the_force_sensor_is_no_touch(press_data: MakeData) -> None:
+    """Where nothing says what is touched, as in a table, the same rows are learned from."""
+    data = press_data(presses=12, rows=200)
+    assert data.in_contact is not None
+    idle = np.sort(np.r_[np.arange(len(data)), np.repeat(np.flatnonzero(~data.in_contact), 20)])
+    noise = np.random.default_rng(1).normal(0.0, 0.03, (len(idle), 3)).astype(np.float32)
+    columns = {name: values[idle] for name, values in data.arrays().items()}
+    told = replace(data, **columns | {"force": data.force[idle] + noise})
+    untold = replace(
+        told, in_contact=None, contact_location=None, centre_of_pressure=None, contact_normal=None
+    )
+    pressed = []
+    for one in (told, untold):
+        known, touched = known_rows(one)
+        assert 0.15 < np.mean(~touched) < 0.25
+        pressed.append(np.count_nonzero(np.linalg.norm(known.force, axis=1) >= 0.5))
+    assert pressed[1] >= 0.95 * pressed[0] > 100
+
+
+@pytest.mark.parametrize("presses", [100, 240, 300, 700])
+def test_many_presses_are_learned_from_as_a_whole(press_data: MakeData, presses: int) -> None:
+    """Not from their ends, which are light touches, and never from too many rows."""
+    data = press_data(presses=presses)
+    known, touched = known_rows(data)
+    assert len(known) <= finger.ROWS_MOST
+    assert len(np.unique(known.press[touched])) >= min(presses, 150)
+    strength = np.linalg.norm(known.force[touched], axis=1)
+    assert 0.4 < np.mean(strength >= 2.0) < 0.8  # of all touched rows: 0.66
+    estimate = estimate_of(ForceLine(known), data.tared_counts.astype(np.float64))
+    assert np.median(np.linalg.norm(estimate - data.force, axis=1)) < 0.05
 
 
 def test_few_presses_are_refused(press_data: MakeData, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,6 +55,16 @@ def test_no_row_is_on_two_sides(data: ExperimentDataset, split: SplitName) -> No
         assert all(len(side) for side in sides), fold.test
         together = np.concatenate(sides)
         assert len(np.unique(together)) == len(together)
+
+
+def test_points_of_names_without_points_are_not_made_up(data: ExperimentDataset) -> None:
+    """As published files are read: their names would be split by indenter."""
+    published = replace(
+        data, trajectories=tuple(f"{data.indenters[k]}/{k}" for k in range(len(data.trajectories)))
+    )
+    assert folds_of(published, "trajectory")
+    with pytest.raises(DatasetError, match=r"name of \w+/0 does not say .* \(90 of 90"):
+        folds_of(published, "point")
 
 
 def held_out(folds: list[Fold]) -> list[str]:

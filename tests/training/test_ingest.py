@@ -21,7 +21,13 @@ from palpate.messages import (
     Tare,
     WrenchFrame,
 )
-from palpate_training.datasets.ingest import ingest_lasa, ingest_record, number_presses
+from palpate_training.datasets.ingest import (
+    PRESS_N,
+    TOUCH_N,
+    ingest_lasa,
+    ingest_record,
+    number_presses,
+)
 
 PERIOD_NS = 10_000_000
 
@@ -327,6 +333,49 @@ def test_a_frame_that_was_overtaken_is_put_in_its_place(record: Record) -> None:
 
 def test_presses_end_halfway() -> None:
     touching = np.array([0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 1], dtype=np.bool_)
-    np.testing.assert_array_equal(number_presses(touching), [0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2])
-    np.testing.assert_array_equal(number_presses(np.zeros(4, np.bool_)), [0, 0, 0, 0])
-    np.testing.assert_array_equal(number_presses(np.ones(4, np.bool_)), [0, 0, 0, 0])
+    for one, presses in (
+        (touching, [0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2]),
+        (np.zeros(4, np.bool_), [0, 0, 0, 0]),
+        (np.ones(4, np.bool_), [0, 0, 0, 0]),
+    ):
+        np.testing.assert_array_equal(number_presses(one, one), presses)
+
+
+@pytest.mark.parametrize(
+    ("touching", "presses"),
+    [
+        ("X..x...X", "00001111"),  # as without it
+        ("X.xxx..X", "00000111"),  # not cut in two
+        ("X..xxx.X", "00011111"),
+        ("x.X.....Xx.x", "000001111111"),
+        ("x..x", "0000"),
+    ],
+)
+def test_a_touch_that_presses_nothing_joins_the_nearer_press(touching: str, presses: str) -> None:
+    rows = np.array(list(touching))
+    found = number_presses(rows != ".", rows == "X")
+    assert "".join(map(str, found)) == presses
+
+
+def test_noise_of_the_force_sensor_makes_no_presses() -> None:
+    """Of slow presses that rise through the threshold of a touch, as a KMS 40 measures them."""
+    rng = np.random.default_rng(0)
+    ramp = np.linspace(0.0, 1.0, 100) ** 2
+    press = np.concatenate([np.zeros(200), ramp, np.ones(100), ramp[::-1], np.zeros(200)])
+    peaks = rng.uniform(1.0, 8.0, (40, 1))
+    force = np.zeros((40 * len(press), 3))
+    force[:, 2] = (peaks * press).ravel()
+    force += rng.normal(0.0, (0.04, 0.04, 0.06), force.shape)
+    strength = np.linalg.norm(force, axis=1)
+    found = number_presses(strength > TOUCH_N, strength >= PRESS_N)
+    true = np.repeat(np.arange(40), len(press))
+    np.testing.assert_array_equal(found[strength >= PRESS_N], true[strength >= PRESS_N])
+    assert found.max() == 39
+
+
+def test_a_contact_that_a_pose_tells_is_a_press_however_light(record: Record) -> None:
+    record.add(TARE, tare(1, 2000.0))
+    record.add(ELECTRODES, *(frame(i) for i in range(1, 31)))
+    record.add(WRENCH, *(replace(wrench(i), force=np.full(3, 0.01, "f4")) for i in range(1, 32)))
+    record.add(POSE, *(pose(i, touches=i % 10 < 5) for i in range(1, 32)))
+    assert len(np.unique(ingest_record(record.write()).group)) == 4

@@ -18,7 +18,9 @@ from palpate_training.cli import train_app
 from palpate_training.datasets.features import FeatureDataset, write_dataset
 from palpate_training.learning.export import run_onnx
 from palpate_training.learning.features_net import FeaturesNetConfig
+from palpate_training.tasks.evaluate import evaluate
 from palpate_training.tasks.features import train_features
+from palpate_training.tasks.intervals import add_intervals
 from palpate_training.tasks.location import correct_location
 
 MakeData = Callable[..., FeatureDataset]
@@ -82,6 +84,13 @@ def test_what_robots_stood_wrong_is_taken_out_and_nothing_else(
         if not np.array_equal(before, after)
     }
     assert changed == {"contact_location", "contact_location_sd"}
+    # What it learned from now is known to it, though its representatives are of the training.
+    assert evaluate(tmp_path / "2", [tmp_path / "exact.h5"]).trained_on
+    with pytest.raises(DatasetError, match=r"was trained on presses of .*exact\.h5"):
+        add_intervals(tmp_path / "2", [tmp_path / "exact.h5"], tmp_path / "3")
+    with pytest.raises(DatasetError, match=r"was trained on presses of .*exact\.h5"):
+        correct_location(tmp_path / "2", [tmp_path / "exact.h5"], tmp_path / "3")
+    assert not evaluate(trained, [tmp_path / "exact.h5"]).trained_on
     # Bounds of the location were those of other errors.
     assert new.manifest.intervals is not None
     assert [one.name for one in new.manifest.intervals.formulas] == ["force_magnitude", "force"]

@@ -102,6 +102,20 @@ def test_bootstrap_averages_seeds_and_repeats() -> None:
     assert low < np.median(errors["e"]) < high
 
 
+def test_bootstrap_draws_clusters_whose_rows_are_anywhere() -> None:
+    """In the order of their names, each with its rows in their order."""
+    rng = np.random.default_rng(2)
+    cluster = rng.integers(0, 9, 200).astype(np.int32) * 5
+    values = rng.normal(size=200)
+    draw = np.random.default_rng(0)
+    means = []
+    for _ in range(50):
+        names = 5 * draw.integers(9, size=9)
+        means.append(np.mean(np.concatenate([values[cluster == name] for name in names])))
+    found = cluster_bootstrap({"e": values}, cluster, statistic=lambda v: float(v.mean()), draws=50)
+    assert found["e"] == pytest.approx(tuple(np.percentile(means, [2.5, 97.5])), rel=1e-12)
+
+
 def test_baselines() -> None:
     rng = np.random.default_rng(1)
     x = rng.normal(size=(50, 19)) * 200 + 30

@@ -171,7 +171,7 @@ def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="palpate train population"):
         load_population_net(tmp_path / WEIGHTS)
     (tmp_path / WEIGHTS).write_bytes(b"no archive")
-    with pytest.raises(DatasetError, match="no network"):
+    with pytest.raises(DatasetError, match="not a readable NumPy archive"):
         load_population_net(tmp_path / WEIGHTS)
     save_population_net(tmp_path / WEIGHTS, PopulationNet(("force",), SMALL))
     with np.load(tmp_path / WEIGHTS) as file:

@@ -134,9 +134,7 @@ def test_without_being_asked_five_folds_a_hundred_rows_apart() -> None:
         contiguous_folds(block, sensor, folds=2)
 
 
-@pytest.mark.parametrize(
-    ("blocks", "validated"), [(1, [0]), (2, [1]), (3, [2]), (12, [2]), (13, [2, 12])]
-)
+@pytest.mark.parametrize(("blocks", "validated"), [(2, [1]), (3, [2]), (12, [2]), (13, [2, 12])])
 def test_every_tenth_block_of_the_seen_sensors_validates(blocks: int, validated: list[int]) -> None:
     block, sensor = labels([blocks * 20, 20], blocks=blocks)
     split = unseen_sensor(sensor, block, test_sensor=1, guard_rows=0)
@@ -194,6 +192,13 @@ def test_what_cannot_be_split_is_named() -> None:
         by_group(block, recording=recording, guard_rows=300)
 
 
+def test_other_sensors_of_a_single_block_are_refused() -> None:
+    """It would validate, and nothing would be left to train on."""
+    sensor = np.repeat([0, 1], 50).astype(np.int32)
+    with pytest.raises(DatasetError, match=r"sensors have 1 blocks, .* nothing to train"):
+        unseen_sensor(sensor, sensor, test_sensor=1, guard_rows=5)
+
+
 def test_a_single_function_splits_rows_at_random() -> None:
     """And its name says so; what it gives is called no result (``folds_of``, ``neighbour``)."""
     public = [name for name, _ in inspect.getmembers(splits, inspect.isfunction) if name[0] != "_"]
@@ -208,6 +213,7 @@ def test_a_single_function_splits_rows_at_random() -> None:
         "last_part",
         "name_of_units",
         "of_units",
+        "press_kind",
         "replace",
         "rows_at_random",
         "rows_of_part",

@@ -128,7 +128,8 @@ def test_whole_numbers_of_groups_are_kept_where_they_tell_presses_apart() -> Non
     known = population(specimens=2, presses=6, each=2)
     numbers = (known.group * 7 + 3) * 2 + known.sensor  # each of one sensor, in no order
     names = table_of(known).column_names
-    columns = ColumnMap.ours(names).model_copy(update={"block": None})
+    apart = {"block": None, "groups_across_sensors": False}
+    columns = ColumnMap.ours(names).model_copy(update=apart)
 
     def read(labels: list[Any]) -> FeatureDataset:
         place = names.index("group")
@@ -169,6 +170,18 @@ def test_a_press_of_several_sensors_is_one_if_the_map_says_so(data: FeatureDatas
         own = cut.block[cut.sensor == sensor]
         assert list(np.unique(own)) == list(range(cut.block.max() + 1))
         assert (np.diff(own) >= 0).all()
+
+
+@pytest.mark.parametrize("names", [("press", "part"), ("group", "block")])
+def test_what_columns_are_called_decides_nothing(
+    data: FeatureDataset, names: tuple[str, str]
+) -> None:
+    table = table_of(data)
+    called = dict(zip(("group", "block"), names, strict=True))
+    table = table.rename_columns([called.get(one, one) for one in table.column_names])
+    told = {"group": names[0], "block": names[1], "groups_across_sensors": False}
+    columns = ColumnMap.ours(table.column_names).model_copy(update=told)
+    same_press(dataset_of(table, columns, source=Path("x")).group, data.group * 10 + data.sensor)
 
 
 def no_rest(table: pa.Table) -> pa.Table:

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.errors import ConfigError
+from palpate.errors import ConfigError, DatasetError
 from palpate.rigid import Transform, quaternions_of, rotation_matrices
 from palpate_training.experiment.clearance import plate_holes
 from palpate_training.experiment.plan import facing
-from palpate_training.experiment.registration import average, frame_of, register
+from palpate_training.experiment.registration import (
+    average,
+    frame_of,
+    register,
+    write_registrations,
+)
 
 Floats = npt.NDArray[np.float64]
 
@@ -187,3 +194,12 @@ def test_holes_that_are_none_are_refused(in_robot: Floats, in_sensor: Floats, ma
 def test_names_belong_to_holes() -> None:
     with pytest.raises(ConfigError, match="a name of its own"):
         register(plate_holes(), plate_holes(), names=("a", "a", "b", "c"))
+
+
+def test_registrations_that_the_disk_refuses_leave_nothing_behind(tmp_path: Path) -> None:
+    true = planted()
+    found = register(true.inverse().apply(plate_holes()), plate_holes())
+    (tmp_path / "arms.json").mkdir()
+    with pytest.raises(DatasetError, match=r"cannot write .*arms\.json"):
+        write_registrations(tmp_path / "arms.json", {"left": found})
+    assert [path.name for path in tmp_path.iterdir()] == ["arms.json"]

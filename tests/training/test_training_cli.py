@@ -146,6 +146,21 @@ def test_experiment_reports_every_model_beside_the_baselines(
     assert len(report.panels[0].truth) == 2 * 4000, "both networks test every row once"
     shown = next(one for one in report.results if one.model == "MLP").metrics
     assert f"{shown[MAGNITUDE]:.3f} N, angle {shown[ANGLE]:.3f} rad" in report.panels[0].title
+    (tmp_path / "refused" / "force-real.md").mkdir(parents=True)
+    with pytest.raises(DatasetError, match=r"cannot write .*force-real\.md"):
+        write_report(tmp_path / "refused", report, command="test")
+
+
+def test_a_report_that_cannot_be_written_is_told_before_the_trainings(
+    two_sensors: FeatureDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_dataset(tmp_path / "two.h5", two_sensors)
+    (tmp_path / "out").touch()
+    monkeypatch.setattr(force_real, "run_force_real", lambda *_, **__: pytest.fail("trained"))
+    words = ["force-real", "--data", str(tmp_path / "two.h5"), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(train_app, words)
+    assert isinstance(result.exception, DatasetError)
+    assert f"cannot write to {tmp_path / 'out'}" in result.exception.problem
 
 
 def test_published_results_meet_the_target() -> None:

@@ -342,7 +342,7 @@ def test_errors_of_processes_name_the_trial(
     damaged = file_of(tmp_path / "trials", "sphere/02/normal")
     damaged.write_bytes(b"half")
     for more in ({}, {"runner": processes, "open_store": PlaneStore}):
-        with pytest.raises(DatasetError, match=r"sphere__02__normal\.npz is damaged"):
+        with pytest.raises(DatasetError, match=r"sphere__02__normal\.npz: not a readable"):
             executed(**more)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +22,13 @@ from palpate_training.evaluation.cells import (
     cells_of,
     make_cells,
     read_cell,
+)
+from palpate_training.experiment.generate.trials import TrialsDone, pack, read_trials
+from palpate_training.learning.population_net import (
+    PopulationConfig,
+    PopulationNet,
+    load_population_net,
+    save_population_net,
 )
 from palpate_training.learning.splits import Fold, RowSplit
 from palpate_training.systems.fields import FIELD_SYSTEMS
@@ -116,17 +126,97 @@ def test_code_that_a_system_builds_on_is_in_its_name(
     assert cells.code_of(system) != before
 
 
-def test_what_was_made_before_a_failure_is_kept(tmp_path: Path) -> None:
-    task = replace(NoiseTask(), systems=(Sometimes("drawn", True), Sometimes("broken", False)))
-    each = list(cells_of(task, [FOLD], [0, 1]))
+@pytest.mark.parametrize("workers", [0, 2])
+def test_the_others_are_made_where_one_fails(
+    tmp_path: Path, workers: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    task = replace(NoiseTask(), systems=(Sometimes("broken", False), Sometimes("drawn", True)))
+    each = list(cells_of(task, [FOLD], [0, 1, 2]))
     with pytest.raises(DatasetError, match="this one fails"):
-        make_cells([task], each, tmp_path, workers=0, on_cell=lambda *_: None)
-    assert [cell_path(tmp_path, task, cell).exists() for cell in each] == [True, True, False]
+        make_cells([task], each, tmp_path, workers=workers, on_cell=lambda *_: None)
+    made = [cell_path(tmp_path, task, cell).exists() for cell in each]
+    assert made == [False, True, True, True]
+    (told,) = caplog.messages
+    assert told.startswith("noise: broken, trajectory all units, seed 0: this one fails")
+
+
+@dataclass(frozen=True)
+class SlowTask(NoiseTask):
+    """Takes a while, leaves a file for each training that began, and gives what Ctrl-C does."""
+
+    systems: tuple[Sometimes, ...] = (Sometimes("drawn", True),)
+    begun: Path = Path()
+
+    def fit_and_test(self, system: Any, rows: RowSplit, seed: int) -> dict[str, Any]:
+        (self.begun / str(seed)).touch()
+        time.sleep(0.2 + 0.3 * (seed % 2))
+        return {"ignored": np.array(signal.getsignal(signal.SIGINT) == signal.SIG_IGN)}
+
+
+def test_on_ctrl_c_nothing_begins_and_what_is_under_way_is_kept(tmp_path: Path) -> None:
+    task = SlowTask(begun=tmp_path / "begun")
+    task.begun.mkdir()
+    each = list(cells_of(task, [FOLD], range(8)))
+    kept: list[Cell] = []
+
+    def on_cell(cell: Cell, _: bool) -> None:
+        kept.append(cell)
+        if len(kept) == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_cells([task], each, tmp_path, workers=2, on_cell=on_cell)
+    begun = {int(path.name) for path in task.begun.iterdir()}
+    paths = {cell.seed: cell_path(tmp_path, task, cell) for cell in each}
+    assert {seed for seed, path in paths.items() if path.exists()} == begun
+    assert len(begun) <= 2
+    assert all(read_cell(paths[seed]).arrays["ignored"] for seed in begun)
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "cell.npz"
     for content in (b"", b"PK\x03\x04 no archive"):
         path.write_bytes(content)
-        with pytest.raises(DatasetError, match=r"cell\.npz is damaged"):
+        with pytest.raises(DatasetError, match=r"cell\.npz: not a readable"):
             read_cell(path)
+    np.savez(path, estimate=np.zeros(3))
+    with pytest.raises(DatasetError, match="seconds"):
+        read_cell(path)
+
+
+def _cell(path: Path) -> None:
+    np.savez_compressed(path, estimate=VALUES, seconds=np.array(1.0))
+
+
+def _trials(path: Path) -> None:
+    counts = {"biotac-1": VALUES}
+    path.write_bytes(pack(TrialsDone("cell", (), (("biotac-2", "why"),), counts, 5)))
+
+
+def _net(path: Path) -> None:
+    save_population_net(path, PopulationNet(("force",), PopulationConfig(width=16, blocks=1)))
+
+
+VALUES = np.round(np.random.default_rng(0).normal(size=(300, 19)), 2)
+
+
+@pytest.mark.parametrize(
+    ("write", "read"),
+    [
+        (_cell, read_cell),
+        (_trials, lambda path: read_trials(path.parent, "cell")),
+        (_net, load_population_net),
+    ],
+)
+def test_damaged_values_of_an_archive_are_told(
+    tmp_path: Path, write: Callable[[Path], None], read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "cell.npz"
+    write(path)
+    with zipfile.ZipFile(path) as archive:
+        largest = max(archive.infolist(), key=lambda one: one.compress_size)
+    whole, begin = path.read_bytes(), largest.header_offset
+    for at in range(begin + 300, begin + largest.compress_size, largest.compress_size // 50):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :])
+        with pytest.raises(DatasetError, match=r"cell\.npz"):
+            read(path)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
@@ -35,6 +36,7 @@ from palpate_training.evaluation.experiments import ExperimentSource
 from palpate_training.evaluation.features import paper_weights, weighted_median
 from palpate_training.evaluation.page import PAPER_LABEL, tables_of, write_pages
 from palpate_training.evaluation.study import Study, StudyPlan, write_study
+from palpate_training.figures.statistics import angled_share
 from palpate_training.systems import ours
 
 SIMPLE = ("zero", "training mean", "ridge")
@@ -57,6 +59,25 @@ def made(data: ExperimentDataset, folder: Path, **plan: Any) -> dict[str, Any]:
     study = Study(ExperimentSource(data, None), StudyPlan(systems=SIMPLE, **plan))
     study.make(folder, workers=0)
     return study.results(folder)
+
+
+def test_what_published_names_do_not_tell_is_left_out(
+    data: ExperimentDataset, tmp_path: Path
+) -> None:
+    """Neither points nor kinds of presses; nor are presses at random angled ones."""
+    named = {
+        "published": tuple(f"{data.indenters[k]}/{k}" for k in range(len(data.trajectories))),
+        "random": tuple(f"cube/{k:05d}/random" for k in range(len(data.trajectories))),
+    }
+    for name, trajectories in named.items():
+        other = replace(data, trajectories=trajectories)
+        assert np.isnan(angled_share(trajectories))
+        values = made(other, tmp_path / name, tasks=("location",))
+        splits = {row["split"] for row in values["scores"]}
+        assert ("point" in splits) == (name == "random")
+        for row in values["scores"]:
+            for kind in ("normal", "angled"):
+                assert np.isnan(row["metrics"][f"distance_m_median_{kind}_presses"])
 
 
 def test_every_cell_of_every_split_is_filled(data: ExperimentDataset, tmp_path: Path) -> None:
@@ -161,11 +182,22 @@ def test_a_study_that_holds_nothing_says_what_there_is(data: ExperimentDataset) 
         Study(ExperimentSource(data, None), StudyPlan(tasks=("field",)))
 
 
+@pytest.mark.parametrize("device", ["gpu", "cuda"])
+def test_a_device_that_is_not_there_is_told_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    words = ["report", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--device", device]
+    result = CliRunner().invoke(train_app, words)
+    assert isinstance(result.exception, ConfigError)
+    assert "no device 'gpu'" in str(result.exception) or "no GPU" in str(result.exception)
+
+
 def test_the_command_reads_a_folder_and_goes_on(data: ExperimentDataset, tmp_path: Path) -> None:
     write_experiment(tmp_path / "experiment.h5", data)
     options: dict[str, Any] = {
         "data": tmp_path, "out": tmp_path / "out", "tasks": "force", "splits": "trajectory",
-        "systems": "zero, ridge", "seeds": 1, "whole": True, "workers": 2, "device": "cpu",
+        "systems": "zero, ridge", "seeds": 1, "whole": True, "workers": 2, "device": "auto",
         "cells": None, "so_far": False,
     }  # fmt: skip
     with pytest.raises(ConfigError, match="holds no finished training"):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from palpate.errors import BundleError, ConfigError
+from palpate.errors import BundleError, ConfigError, DatasetError
 from palpate.files.bundle import read_bundle
 from palpate_training.cli import train_app
 from palpate_training.datasets.experiment import MixedDataset, write_mixed
@@ -37,6 +37,11 @@ def test_one_command_trains_all_bundles_and_writes_their_cards(
     again = CliRunner().invoke(train_app, [*arguments, "--version", "8"])
     assert isinstance(again.exception, BundleError)
     assert not (tmp_path / "models" / "features-mine" / "8").exists()
+    # Nor is anything trained where the specimen of the last one is not known.
+    again = CliRunner().invoke(train_app, [*arguments, "--version", "9", "--unit", "biotac-9"])
+    assert isinstance(again.exception, DatasetError)
+    assert "biotac-9" in str(again.exception)
+    assert not (tmp_path / "models" / "features-mine" / "9").exists()
 
 
 def test_published_files_have_features_alone_and_it_says_so(

@@ -71,7 +71,9 @@ def train_report(
         bool, typer.Option("--whole", help="Only tests of all units together.")
     ] = False,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 = one for each core.")] = 0,
-    device: Annotated[str, typer.Option(help="Where networks are trained: cpu or cuda.")] = "cpu",
+    device: Annotated[
+        str, typer.Option(help="Where networks are trained: cpu, cuda, auto.")
+    ] = "cpu",
     cells: Annotated[
         Path | None, typer.Option(help="Folder of finished trainings; by default OUT/cells.")
     ] = None,
@@ -90,8 +92,10 @@ def train_report(
     from palpate_training.evaluation.experiments import TASKS
     from palpate_training.evaluation.page import write_pages
     from palpate_training.evaluation.study import Study, StudyPlan, write_study
+    from palpate_training.learning.networks import training_device
     from palpate_training.learning.splits import PART_SPLITS, SPLITS
 
+    device = training_device(device)
     wanted = _words(splits)
     unknown = [word for word in wanted if word not in SPLITS]
     if unknown:

@@ -165,6 +165,7 @@ def train_all(
     from palpate_training.datasets.features import write_dataset
     from palpate_training.datasets.inspect import load
     from palpate_training.learning.export import refuse_existing
+    from palpate_training.learning.splits import by_trajectory, of_units
 
     _, experiment = load(data)
     tasks = (
@@ -175,6 +176,10 @@ def train_all(
     folders = {task: out / f"{task}-{name}" / str(version) for task in tasks}
     for folder in folders.values():
         refuse_existing(folder)
+    if isinstance(experiment, MixedDataset):
+        chosen = unit or experiment.experiment.unit_names[0]
+        # The last training would refuse an unknown one, hours later.
+        of_units(experiment.experiment, by_trajectory(experiment.experiment, seed=seed), [chosen])
     with tempfile.TemporaryDirectory() as scratch:
         rows = Path(scratch) / "features.h5"
         write_dataset(rows, features(experiment, assumed_rest=assumed_rest))
@@ -191,7 +196,6 @@ def train_all(
             batch_rows,
         )
     if isinstance(experiment, MixedDataset):
-        chosen = unit or experiment.experiment.unit_names[0]
         train_field(
             data,
             folders["field"],
@@ -234,10 +238,16 @@ def train_force_real(
 
     palpate train force-real --data lasa.h5 --out docs/results
     """
-    from palpate_training.tasks.force_real import experiment_count, run_force_real, write_report
+    from palpate_training.tasks.force_real import (
+        experiment_count,
+        run_force_real,
+        try_folder,
+        write_report,
+    )
     from palpate_training.tasks.results import rich_table
 
     dataset = open_dataset(data)
+    try_folder(out)
     with _progress() as progress:
         task = progress.add_task("networks", total=experiment_count(dataset, seeds))
         report = run_force_real(dataset, seeds=seeds, on_network=lambda: progress.advance(task))

@@ -49,6 +49,9 @@ TOUCH_N = 0.2
 """Without a pose that knows contact, a force above this is contact [N]; it is above the noise of a
 6-axis sensor."""
 
+PRESS_N = 0.5
+"""What does not reach this force is no press [N]."""
+
 Times = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
@@ -75,7 +78,7 @@ def ingest_record(path: Path, *, command: str = "", licence: str = "own record")
     record has poses of that sensor): between two readings that are at most three periods apart. A
     group is a press: it ends halfway between two contacts.
     Where the source of the poses cannot know whether it touches, a force above ``TOUCH_N`` counts
-    as contact.
+    as contact, and as a press of its own only what reaches ``PRESS_N``.
 
     Args:
         path: ``NAME.mcap``.
@@ -194,14 +197,17 @@ def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArr
 
     force, kept = force_at(at, streams, clock)
     location = None
-    touching = np.linalg.norm(force, axis=1) > TOUCH_N
+    strength = np.linalg.norm(force, axis=1)
+    touching, pressing = strength > TOUCH_N, strength >= PRESS_N
     if streams.poses:
         positions = np.array([p.position for p in streams.poses], dtype=np.float64)
         # NaN = not known, and so is what lies between a known and an unknown one
         contact = np.array([[p.in_contact] for p in streams.poses], dtype=np.float64)
         both, has_pose = linear(at, times_of(streams.poses, clock), np.hstack([positions, contact]))
         location = both[:, :3]
-        touching = np.where(np.isnan(both[:, 3]), touching, both[:, 3] >= 0.5)
+        told = ~np.isnan(both[:, 3])
+        touching = np.where(told, both[:, 3] >= 0.5, touching)
+        pressing = np.where(told, touching, pressing)
         kept = kept & has_pose
     if not kept.any():
         raise DatasetError(
@@ -215,7 +221,7 @@ def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArr
         "electrodes": np.array([frame.electrodes for frame in frames], dtype=np.uint16)[kept],
         "baseline": baseline.astype(np.float32)[kept],
         "force": force.astype(np.float32)[kept],
-        "group": number_presses(touching[kept]),
+        "group": number_presses(touching[kept], pressing[kept]),
         "in_contact": touching[kept],
         "time_ns": times[kept],
     }
@@ -287,17 +293,27 @@ def middles(frames: Sequence[ElectrodeFrame]) -> Times:
     return np.array([sample_offsets(frame).middle_ns for frame in frames], dtype=np.int64)
 
 
-def number_presses(touching: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+def number_presses(
+    touching: npt.NDArray[np.bool_], pressing: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.int32]:
     """Press of every row, from 0; a press ends halfway between two contacts.
+
+    A contact in which nothing presses, such as noise of the force sensor while the force rises
+    through the threshold of a touch, belongs to the press that is nearer.
 
     Args:
         touching: Whether the indenter touches, shape ``(N,)``, in order of time.
+        pressing: Rows of which one makes a contact a press, shape ``(N,)``.
     """
     edges = np.diff(touching.astype(np.int8), prepend=0, append=0)
-    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    contacts = np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], axis=1)
+    pressed = np.array([pressing[start:end].any() for start, end in contacts], dtype=np.bool_)
     press = np.zeros(len(touching), dtype=np.int32)
-    for end, start in zip(ends[:-1], starts[1:], strict=True):
-        press[(end + start) // 2 :] += 1
+    for (_, end), (start, _) in itertools.pairwise(contacts[pressed]):
+        half = (end + start) // 2
+        for first, last in contacts[(contacts[:, 0] < half) & (half < contacts[:, 1])]:
+            half = last if first - end < start - last else first
+        press[half:] += 1
     return press
 
 

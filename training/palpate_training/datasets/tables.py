@@ -176,8 +176,14 @@ class ColumnMap(BaseModel):
         single = {
             name: name for name in ("in_contact", "group", "block", "sensor") if name in columns
         }
-        time = "time_ns" if "time_ns" in columns else None
-        return cls.model_validate({**known, "rest": rest, "time": time, "time_unit": "ns"} | single)
+        more = {
+            "rest": rest,
+            "time": "time_ns" if "time_ns" in columns else None,
+            "time_unit": "ns",
+            "groups_across_sensors": {"group", "block"}
+            <= set(columns),  # as `table_of` writes them
+        }
+        return cls.model_validate(known | more | single)
 
 
 def columns_of(name: str) -> list[str]:
@@ -321,8 +327,7 @@ def dataset_of(
         arrays["baseline"] = _rest(arrays, columns.rest_rows, np.flatnonzero(kept), source)
     check_rest(arrays["baseline"], np.flatnonzero(kept), str(source))
     check_forces(arrays["force"], np.flatnonzero(kept), str(source))
-    ours = (columns.group, columns.block) == ("group", "block")  # as `table_of` writes them
-    across = columns.groups_across_sensors or ours
+    across = columns.groups_across_sensors
     arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
     if "time_ns" in arrays:
         _check_order(arrays, np.flatnonzero(kept), source)

@@ -61,6 +61,19 @@ class TrialHeader:
     arm: str
 
 
+PRESS_KINDS = ("normal", "angled", "path", "random")
+"""How a finger is pressed at a point: the third part of a trajectory's id, without its number."""
+
+
+def press_kind(trajectory: str) -> str:
+    """Kind of a trajectory by its id, one of ``PRESS_KINDS``; empty where the id does not tell it.
+
+    Those of published files do not: they are ``<indenter>/<number>``.
+    """
+    kind = trajectory.rpartition("/")[2].partition("-")[0]
+    return kind if kind in PRESS_KINDS else ""
+
+
 def trial_name(header: TrialHeader) -> str:
     """Unit and trajectory, as messages name a trial."""
     return f"{header.unit} {header.trajectory}"

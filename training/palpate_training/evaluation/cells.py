@@ -1,8 +1,9 @@
 """One cell of a table: a system, trained on the rows of a fold from a seed, tested on the others.
 
-Cells are kept in a folder, each in a file named by a hash of all that decides it: the data, the
-rows of each side, the seed and the code of the system. So a run that was killed goes on where it
-was, and what has changed is made again. The work is spread over processes.
+Cells are kept in a folder, each in a file named by a hash of what decides it: the data, the rows
+of each side, the seed and the code of the system (`cell_key` says what is left out). So a run that
+was killed goes on where it was, and what has changed is made again. The work is spread over
+processes.
 """
 
 from __future__ import annotations
@@ -10,14 +11,16 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 import multiprocessing
 import os
+import signal
 import sys
 import time
-import zipfile
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import cache, partial
 from multiprocessing.sharedctypes import Synchronized
@@ -29,11 +32,15 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from palpate.cluster import WorkerLostError
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate.files.hdf5 import add_array
+from palpate_training.datasets.container import read_archive
 from palpate_training.experiment.generate.workers import end_with_parent
 from palpate_training.learning.splits import Fold, RowSplit
+
+_log = logging.getLogger(__name__)
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -131,7 +138,11 @@ def cells_of(task: Task, folds: Iterable[Fold], seeds: Sequence[int]) -> Iterato
 
 
 def cell_key(task: Task, cell: Cell) -> str:
-    """Hash of all that decides a cell, hex."""
+    """Hash of the data, the rows, the seed, the system and its code in this package, hex.
+
+    What else may change results does not make kept ones anew: the device, the versions of the
+    libraries, and ``palpate`` itself, whose places of the electrodes many systems read.
+    """
     digest = hashlib.sha256()
     facts = [task.name, task.data_sha256, cell.system, cell.seed, code_of(_system(task, cell))]
     digest.update(json.dumps(facts).encode())
@@ -183,14 +194,12 @@ def read_cell(path: Path) -> CellResult:
     Raises:
         DatasetError: The file is damaged; names it.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        return CellResult(arrays, float(arrays.pop("seconds")))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise DatasetError(
-            f"{path} is damaged: {error}", remedy="remove it and run the command again"
-        ) from error
+    arrays = read_archive(
+        path,
+        lambda held: dict.fromkeys([*held, "seconds"]),
+        remedy="remove it and run the command again",
+    )
+    return CellResult(arrays, float(arrays.pop("seconds")))
 
 
 def make_cells(
@@ -206,9 +215,13 @@ def make_cells(
 
     Networks are trained on ``device``, as torch calls it; with ``cuda`` the processes take turns
     among the GPUs that there are. ``on_cell`` is told each cell, and whether it had to be made.
+    A training that fails is logged, and the others go on. Whatever ends this early, Ctrl-C too,
+    those under way are waited for and kept.
 
     Raises:
         DatasetError: The disk refuses.
+        WorkerLostError: A process died, e.g. because memory ran out.
+        Exception: What the first training that failed raised, once all others are kept.
     """
     by_name = {task.name: task for task in tasks}
     left = []
@@ -217,47 +230,77 @@ def make_cells(
             on_cell(cell, False)
         else:
             left.append(cell)
+    failed: list[Exception] = []
+
+    def finish(cell: Cell, made: Callable[[], bytes]) -> None:
+        try:
+            content = made()
+        except BrokenProcessPool:
+            raise
+        except Exception as error:  # of any library that a system is made with
+            test = f"{cell.fold.split} {cell.fold.test} {cell.fold.part}".rstrip()
+            _log.warning("%s: %s, %s, seed %d: %s", cell.task, cell.system, test, cell.seed, error)
+            failed.append(error)
+            return
+        _keep(folder, by_name[cell.task], cell, content)
+        on_cell(cell, True)
+
     if workers == 0:
         for cell in left:
             with torch.device(device):
-                content = _made(by_name[cell.task], cell)
-            _keep(folder, by_name[cell.task], cell, content)
-            on_cell(cell, True)
-        return
+                finish(cell, partial(_made, by_name[cell.task], cell))
+    else:
+        _make_in_processes(by_name, left, workers, device, finish)
+    if failed:
+        raise failed[0]
+
+
+def _make_in_processes(
+    tasks: dict[str, Task],
+    cells: Sequence[Cell],
+    workers: int,
+    device: str,
+    finish: Callable[[Cell, Callable[[], bytes]], None],
+) -> None:
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        min(workers, max(1, len(left))),
+    pool = ProcessPoolExecutor(
+        min(workers, max(1, len(cells))),
         mp_context=context,
         initializer=_take_tasks,
-        initargs=(by_name, device, context.Value("i", 0)),
-    ) as pool:
-        waiting = iter(left)
-        running: dict[Future[bytes], Cell] = {}
-        # A few at a time, so that what is asked for does not lie in memory for all cells.
-        for cell in waiting:
+        initargs=(tasks, device, context.Value("i", 0)),
+    )
+    running: dict[Future[bytes], Cell] = {}
+
+    def finish_some() -> None:
+        for done in wait(running, return_when=FIRST_COMPLETED).done:
+            finish(running[done], done.result)
+            del running[done]
+
+    try:
+        # One a process, so that nothing that was asked for is still to begin when this ends.
+        for cell in cells:
             running[pool.submit(_work, cell)] = cell
-            if len(running) >= 2 * workers:
-                _finish_some(running, folder, by_name, on_cell)
+            if len(running) >= workers:
+                finish_some()
         while running:
-            _finish_some(running, folder, by_name, on_cell)
-
-
-def _finish_some(
-    running: dict[Future[bytes], Cell],
-    folder: Path,
-    tasks: dict[str, Task],
-    on_cell: Callable[[Cell, bool], None],
-) -> None:
-    for done in wait(running, return_when=FIRST_COMPLETED).done:
-        cell = running.pop(done)
-        _keep(folder, tasks[cell.task], cell, done.result())
-        on_cell(cell, True)
+            finish_some()
+    except BrokenProcessPool as error:
+        raise WorkerLostError(
+            "a worker process died", remedy="give it more memory, or use fewer workers"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+        for future, cell in running.items():
+            if not future.cancelled() and future.exception() is None:
+                finish(cell, future.result)
 
 
 _tasks: dict[str, Task] = {}
 
 
 def _take_tasks(tasks: dict[str, Task], device: str, begun: Synchronized[int]) -> None:
+    # Ctrl-C is for the command, which keeps what is under way.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     os.nice(5)  # so that the machine stays usable during a night's work
     if device == "cuda":

@@ -16,6 +16,7 @@ from palpate_training.datasets.experiment import (
     MixedDataset,
     content_sha256,
 )
+from palpate_training.datasets.trials import press_kind
 from palpate_training.evaluation.cells import Task
 from palpate_training.evaluation.features import FeatureTask, force_shares, systems_of
 from palpate_training.evaluation.pictures import Made, Picture, draw_forces, draw_task
@@ -78,20 +79,24 @@ class ExperimentSource:
     def _features(self, name: Quantity, data: ExperimentDataset | MixedDataset) -> FeatureTask:
         rows = data.experiment if isinstance(data, MixedDataset) else data
         contact = data.contact if isinstance(data, MixedDataset) else None
-        angled = np.array([not each.endswith("/normal") for each in rows.trajectories])
+        kind = np.array([press_kind(each) for each in rows.trajectories])
         return FeatureTask(
             name,
             content_sha256(data),
             samples_of(rows, contact),
             cluster=rows.row_trajectory,
-            angled=angled[rows.row_trajectory],
+            kind=kind[rows.row_trajectory],
             systems=systems_of(name),
         )
 
     def splits(self, task: str) -> tuple[SplitName, ...]:
-        """Splits of a task; the first is trained with several seeds."""
+        """Splits of a task that the data can be split by; the first gets several seeds."""
         splits = TASK_SPLITS[task]
-        return tuple(one for one in splits if one in PART_SPLITS) if self.part else splits
+        if self.part:
+            return tuple(one for one in splits if one in PART_SPLITS)
+        if not all(press_kind(each) for each in self._rows(task).trajectories):
+            return tuple(one for one in splits if one != "point")
+        return splits
 
     def folds(self, task: str, split: SplitName, *, seed: int, whole: bool) -> list[Fold]:
         """Trainings of a split; ``whole``: only those of all units together, in every split."""

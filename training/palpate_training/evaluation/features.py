@@ -57,7 +57,7 @@ class FeatureTask:
         samples: All rows.
         cluster: What is drawn as a whole for intervals, of each row, shape (N,): its trajectory, or
             its part of a recording.
-        angled: Whether the press of a row is angled, shape (N,).
+        kind: How the finger was pressed, as ``press_kind`` tells it, of each row, shape (N,).
         systems: That can estimate it.
     """
 
@@ -65,7 +65,7 @@ class FeatureTask:
     data_sha256: str
     samples: Samples
     cluster: IndexArray
-    angled: npt.NDArray[np.bool_]
+    kind: npt.NDArray[np.str_]
     systems: tuple[System, ...]
 
     def fit_and_test(self, system: Tested, rows: RowSplit, seed: int) -> Arrays:
@@ -114,13 +114,13 @@ class TestedRows:
     Attributes:
         truth: The quantity, shape (N, 3).
         force_n: True magnitude of the force [N], shape (N,).
-        angled: Whether the press is angled, shape (N,).
+        kind: How the finger was pressed, shape (N,).
         part: Part of each row, shape (N,).
     """
 
     truth: Floats
     force_n: Floats
-    angled: npt.NDArray[np.bool_]
+    kind: npt.NDArray[np.str_]
     part: npt.NDArray[np.str_]
 
 
@@ -184,7 +184,7 @@ def score(task: FeatureTask, results: Mapping[Cell, CellResult]) -> list[Scores]
         tested = TestedRows(
             truth=task.samples.truth(task.name)[one.rows].astype(np.float64),
             force_n=_magnitude(task, one.rows),
-            angled=task.angled[one.rows],
+            kind=task.kind[one.rows],
             part=one.part,
         )
         errors = [row_errors(task.name, each, tested.truth) for each in one.estimates]
@@ -225,7 +225,7 @@ def summary(errors: Sequence[RowErrors], tested: TestedRows) -> dict[str, float]
         for name, (low, high) in FORCE_BINS_N.items()
     }
     masks["from_2n"] = tested.force_n >= FORCE_BINS_N["2_to_8n"][0]
-    masks |= {"normal_presses": ~tested.angled, "angled_presses": tested.angled}
+    masks |= {f"{kind}_presses": tested.kind == kind for kind in ("normal", "angled")}
     weights = paper_weights(tested.force_n)
     each = []
     for one in errors:

@@ -96,7 +96,7 @@ class RecordingSource:
             rows.sha256,
             rows.samples,
             cluster=rows.block,
-            angled=np.zeros(len(rows.samples), bool),
+            kind=np.full(len(rows.samples), ""),
             systems=rows.systems,
         )
 

@@ -14,7 +14,6 @@ Registrations on disk: measured holes as a CSV file in, registrations of the arm
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ import numpy.typing as npt
 from pydantic import Field, ValidationError
 
 from palpate.errors import ConfigError
+from palpate.files.atomic import written_whole
 from palpate.process import require
 from palpate.rigid import Floats, Transform
 from palpate_training.datasets.container import csv_rows
@@ -319,7 +319,8 @@ def write_registrations(path: Path, found: Mapping[str, ArmRegistration]) -> Pat
     """Write registrations by arm; the file appears whole or not at all.
 
     Raises:
-        ConfigError: There is none, or the disk refuses.
+        ConfigError: There is none.
+        DatasetError: The disk refuses.
     """
     if not found:
         raise ConfigError(f"{path}: no arm is registered", remedy="measure holes of at least one")
@@ -338,14 +339,8 @@ def write_registrations(path: Path, found: Mapping[str, ArmRegistration]) -> Pat
             for arm, item in found.items()
         },
     )
-    part = path.with_name(path.name + ".part")
-    try:
+    with written_whole(path) as part:
         part.write_text(content.model_dump_json(by_alias=True, indent=1) + "\n", encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        raise ConfigError(
-            f"cannot write {path}: {error}", remedy="check the folder's rights and free space"
-        ) from error
     return path
 
 

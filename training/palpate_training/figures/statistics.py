@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from palpate.anatomy import core_normal
 from palpate_training.datasets.experiment import ExperimentDataset
+from palpate_training.datasets.trials import press_kind
 from palpate_training.figures.skin import final_rows
 
 Floats = npt.NDArray[np.float64]
@@ -151,9 +152,9 @@ def shear_ratio(force: Floats, location: Floats) -> Floats:
 def angled_share(trajectories: Sequence[str]) -> float:
     """Share of trajectories planned angled, by their ids ``<indenter>/<point>/<normal|angled-k>``.
 
-    NaN where an id has another form, as those of published files may.
+    NaN where an id has another form, as those of published files.
     """
-    kinds = [name.rpartition("/")[2].partition("-")[0] for name in trajectories]
+    kinds = [press_kind(name) for name in trajectories]
     if not kinds or not set(kinds) <= {"normal", "angled"}:
         return float("nan")
     return kinds.count("angled") / len(kinds)

@@ -42,8 +42,13 @@ are light touches, and the bound of a hard press must not be what suits these.""
 ROWS_OF_PRESS = 20
 """Rows of a press that the regression sees at most; neighbours say the same."""
 
+ROWS_LEAST = 3
+"""Of each press; fewer than these, from its first to its last, were its ends alone."""
+
 ROWS_MOST = 12_000
-"""Rows that it sees in all, but for two of each press: its time grows faster than they do."""
+"""Rows that it sees in all: its time grows faster than they do."""
+
+GOLDEN_RATIO = (np.sqrt(5.0) - 1.0) / 2.0
 
 EVERY_TERM = (True,) * len(TERMS)
 
@@ -72,6 +77,21 @@ def covered(errors: Floats, bounds: Floats, press: Labels) -> float:
     _, number, rows = np.unique(press, return_inverse=True, return_counts=True)
     inside = np.bincount(number, errors <= bounds) / rows
     return float(inside.mean())
+
+
+def staggered(presses: Sequence[Labels], count: int) -> Labels:
+    """At most ``count`` rows of many presses, dealt evenly, each from another part of its press.
+
+    Args:
+        presses: The rows of each press, in order of time; may be more than ``count``.
+        count: Rows in all.
+    """
+    press = (np.arange(count) * len(presses) // count).tolist()
+    # Multiples of the golden ratio fall evenly into an interval, however many are taken, and any
+    # few in a row lie far apart.
+    part = np.arange(count) * GOLDEN_RATIO % 1.0
+    dealt = [presses[k][int(at * len(presses[k]))] for k, at in zip(press, part, strict=True)]
+    return np.unique(dealt)
 
 
 def fit_formula(
@@ -209,7 +229,9 @@ def _thinned(press: Labels) -> Labels:
     """At most ``ROWS_OF_PRESS`` rows of each press, evenly, and fewer of many presses."""
     order = np.argsort(press, kind="stable")
     presses = np.split(order, np.flatnonzero(np.diff(press[order])) + 1)
-    most = max(2, min(ROWS_OF_PRESS, ROWS_MOST // len(presses)))
+    most = min(ROWS_OF_PRESS, ROWS_MOST // len(presses))
+    if most < ROWS_LEAST:
+        return staggered(presses, ROWS_MOST)
     parts = [
         rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)] for rows in presses
     ]

@@ -159,7 +159,8 @@ def cluster_bootstrap(
         ``(low, high)`` for each name.
     """
     names = list(errors)
-    members = [np.flatnonzero(cluster == one) for one in np.unique(cluster)]
+    order = np.argsort(cluster, kind="stable")
+    members = np.split(order, np.flatnonzero(np.diff(cluster[order])) + 1)
     rng = np.random.default_rng(seed)
     results = np.empty((draws, len(names)))
     columns = [np.atleast_2d(errors[name].T) for name in names]  # each (S, N)

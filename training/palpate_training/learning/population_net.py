@@ -20,7 +20,6 @@ what they have in common is an input of its own, and training moves it at random
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -35,6 +34,7 @@ from palpate.anatomy import ELECTRODE_MIRROR
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate.messages import COUNTS_MAX
+from palpate_training.datasets.container import read_archive
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.learning.electrode_nets import MIRROR_AXES, log_impedance
 from palpate_training.learning.fit import FitConfig
@@ -290,9 +290,9 @@ def load_population_net(path: Path) -> PopulationNet:
     Raises:
         DatasetError: There is no such file, or it holds something else.
     """
+    remedy = "give the folder that `palpate train population` wrote"
+    arrays = read_archive(path, list, remedy=remedy)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
         settings = json.loads(str(arrays.pop("settings")))
         if settings["format"] != _FORMAT:
             raise ValueError(f"format {settings['format']!r}")
@@ -300,9 +300,8 @@ def load_population_net(path: Path) -> PopulationNet:
         config = {name: value for name, value in settings["config"].items() if name in known}
         net = PopulationNet(settings["quantities"], PopulationConfig(**config))
         net.load_state_dict({name: torch.from_numpy(values) for name, values in arrays.items()})
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError, zipfile.BadZipFile) as error:
+    except (KeyError, ValueError, TypeError, RuntimeError) as error:
         raise DatasetError(
-            f"{path} holds no network of a population: {error}",
-            remedy="give the folder that `palpate train population` wrote",
+            f"{path} holds no network of a population: {error}", remedy=remedy
         ) from error
     return net.eval()

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from palpate.errors import ConfigError, DatasetError
 from palpate_training.datasets.basis import subset
 from palpate_training.datasets.experiment import ExperimentDataset
+from palpate_training.datasets.trials import press_kind
 
 Rows = npt.NDArray[np.int64]
 Labels = npt.NDArray[np.int32]
@@ -118,6 +119,9 @@ def unseen_sensor(
 
     Sensor and block are those of every row, shape ``(N,)``. Each tenth block of the others
     validates; rows beside it are left out.
+
+    Raises:
+        DatasetError: It is no sensor or the only one, or the others leave nothing to train on.
     """
     test = sensor == test_sensor
     if not test.any() or test.all():
@@ -127,7 +131,14 @@ def unseen_sensor(
         )
     seen = np.unique(block[~test])
     validation = np.isin(block, seen[2::10] if len(seen) > 2 else seen[-1:]) & ~test
-    return _guarded(validation, test, sensor, guard_rows)
+    split = _guarded(validation, test, sensor, guard_rows)
+    if not (len(split.train) and len(split.validation)):
+        raise DatasetError(
+            f"the other sensors have {len(seen)} blocks, of which a guard of {guard_rows} rows"
+            " leaves nothing to train or validate on",
+            remedy="cut their recordings into more blocks, or use longer recordings",
+        )
+    return split
 
 
 HELD_OUT_MOST = 1000
@@ -300,7 +311,8 @@ def folds_of(data: ExperimentDataset, split: SplitName, *, seed: int = 0) -> lis
     ``execution`` differs from ``trajectory`` only where several units are trained on together.
 
     Raises:
-        DatasetError: The data set has too few trajectories, points, indenters or units.
+        DatasetError: The data set has too few trajectories, points, indenters or units, or does not
+            say which points it has.
     """
     folds = list(_folds(data, split, seed))
     if not folds:
@@ -402,7 +414,13 @@ def _groups(data: ExperimentDataset, split: SplitName) -> Labels:
         return data.trial
     if split == "trajectory":
         return data.row_trajectory
-    points = [name.rpartition("/")[0] or name for name in data.trajectories]
+    if unknown := [name for name in data.trajectories if not press_kind(name)]:
+        raise DatasetError(
+            f"the data set cannot be split by point: the name of {unknown[0]} does not say at which"
+            f" it is ({len(unknown)} of {len(data.trajectories)} trajectories)",
+            remedy="split it by trajectory; the files that the paper published do not tell points",
+        )
+    points = [name.rpartition("/")[0] for name in data.trajectories]
     _, number = np.unique(points, return_inverse=True)
     return number.astype(np.int32)[data.row_trajectory]
 

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate.files.bundle import Bundle, read_bundle
 from palpate.files.hdf5 import schema_of
+from palpate.files.manifest import Manifest
 from palpate_training.datasets.container import Provenance, refuse_repeated
 from palpate_training.datasets.experiment import (
     ExperimentDataset,
@@ -263,7 +264,7 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
         rows=len(errors.press),
         presses=len(np.unique(errors.press)),
         figures=tuple(_figures(errors)),
-        trained_on=manifest.training_data_sha256 in digests
+        trained_on=not digests.isdisjoint(learned_from(manifest))
         # A part of the training, or a copy of it, has another digest.
         or (known is not None and any(holds_known(known, tared) for tared in inputs)),
         training=manifest.trained_on,
@@ -278,6 +279,16 @@ def _check_mesh(bundle: Bundle, data: MixedDataset, path: Path) -> None:
             f"{bundle.manifest.mesh_sha256[:12]}",
             remedy="take a data set of the mesh that the bundle was trained on",
         )
+
+
+LOCATION_DATA = "location_data_sha256"
+"""Key of ``normalisation``: digests of the data sets that the location was freed of errors by."""
+
+
+def learned_from(manifest: Manifest) -> set[str]:
+    """Digests of the data sets that a bundle learned from, hex."""
+    more = str(manifest.normalisation.get(LOCATION_DATA, "")).split()
+    return {manifest.training_data_sha256, *more}
 
 
 def read_features(path: Path) -> tuple[FeatureDataset, Provenance, str]:

@@ -25,6 +25,7 @@ from palpate.errors import DatasetError
 from palpate.files.intervals import BoundFormula, Intervals
 from palpate.messages import TrainingRange
 from palpate_training.datasets.features import FeatureDataset, check_learnable
+from palpate_training.datasets.ingest import PRESS_N, TOUCH_N
 from palpate_training.learning.export import export_features, refuse_existing
 from palpate_training.learning.force_process import (
     LOCALITIES,
@@ -33,7 +34,14 @@ from palpate_training.learning.force_process import (
     KnownRows,
 )
 from palpate_training.learning.graphs import FeaturesGraph
-from palpate_training.learning.intervals import LEVEL, bounds, fit_formulas, terms_of, widened
+from palpate_training.learning.intervals import (
+    LEVEL,
+    bounds,
+    fit_formulas,
+    staggered,
+    terms_of,
+    widened,
+)
 from palpate_training.learning.metrics import force_errors, force_metrics
 from palpate_training.learning.other_fingers import OtherFinger, OtherFingers, SharedForce
 from palpate_training.learning.ranges import ends_of, known_inputs
@@ -46,11 +54,12 @@ Rows = npt.NDArray[np.integer]
 PRESSES_LEAST = 6
 """Fewer presses cannot be held out and chosen on at once."""
 
-PRESS_N = 0.5
-"""What does not reach this force is no press [N]."""
-
 ROWS_MOST = 600
 """Rows that are fitted to; neighbours say nearly the same, and an estimate costs time for each."""
+
+ROWS_OF_PRESS_LEAST = 8
+"""Of so many of each press the first and the last are kept; of fewer these would be too large a
+share: they are the lightest touches."""
 
 UNTOUCHED_SHARE = 0.2
 """Share of them that is untouched, where the data has such rows."""
@@ -64,9 +73,6 @@ CHOICES = 3
 _DEVIATIONS = 1.6449
 """``LEVEL`` of the errors shall lie within so many standard deviations, as of a normal
 distribution."""
-
-_THRESHOLD_UNKNOWN_N = 0.2
-"""Where no row is untouched: above the noise of a six-axis sensor [N]."""
 
 _GOLDEN_ROWS = 64
 
@@ -176,7 +182,7 @@ def train_finger(
         said,
         estimator=estimator,
         source=source,
-        held_out_as="each press held out in its turn",
+        held_out_as=f"presses held out in {FOLDS} parts",
         data_sha256=data.content_sha256(),
         contact_sd=told.contact_sd if told else None,
         normalisation={"of a contact": f"of the network; errors are those on {told.source}"}
@@ -241,7 +247,7 @@ class HeldOutPresses:
         return cls(
             metrics,
             force_sd,
-            threshold_above(untouched_n) if len(untouched_n) else _THRESHOLD_UNKNOWN_N,
+            threshold_above(untouched_n) if len(untouched_n) else TOUCH_N,
             finger_formulas(estimate[touched], truth, press, follow=follow),
             len(np.unique(press)),
         )
@@ -370,7 +376,7 @@ def known_rows(data: FeatureDataset) -> tuple[KnownRows, npt.NDArray[np.bool_]]:
             remedy="calibrate one finger at a time",
         )
     magnitude = np.linalg.norm(data.force, axis=1)
-    touched = magnitude > 0.0 if data.in_contact is None else data.in_contact
+    touched = data.touching(TOUCH_N)
     press = data.group if len(np.unique(data.group)) >= PRESSES_LEAST else data.block
     pieces: list[Rows] = [
         piece
@@ -387,7 +393,12 @@ def known_rows(data: FeatureDataset) -> tuple[KnownRows, npt.NDArray[np.bool_]]:
     untouched = np.flatnonzero(~touched & np.isin(press, [press[piece[0]] for piece in pieces]))
     free = min(len(untouched), int(UNTOUCHED_SHARE * ROWS_MOST))
     each = (ROWS_MOST - free) // len(pieces)
-    kept = np.sort(np.concatenate([_evenly(untouched, free), *(_evenly(p, each) for p in pieces)]))
+    dealt = (
+        [_evenly(piece, each) for piece in pieces]
+        if each >= ROWS_OF_PRESS_LEAST
+        else [staggered(pieces, ROWS_MOST - free)]
+    )
+    kept = np.sort(np.concatenate([_evenly(untouched, free), *dealt]))
     rows = KnownRows(
         data.tared_counts[kept].astype(np.float64), data.force[kept].astype(np.float64), press[kept]
     )
@@ -395,7 +406,6 @@ def known_rows(data: FeatureDataset) -> tuple[KnownRows, npt.NDArray[np.bool_]]:
 
 
 def _evenly(rows: Rows, count: int) -> Rows:
-    count = max(1, count) if len(rows) else 0
     kept: Rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int))]
     return kept
 

@@ -10,6 +10,7 @@ trained on the other finger. Longer and shorter blocks are reported beside.
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
+from palpate.files.atomic import written_whole
 from palpate.process import require
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks
 from palpate_training.figures.style import new_figure, save
@@ -225,20 +227,40 @@ chosen on half of the test rows, and the errors may be somewhat too small.
 """
 
 
+def try_folder(folder: Path) -> None:
+    """Make the folder of a report, and write to it, before trainings take minutes.
+
+    Raises:
+        DatasetError: That is not possible.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise DatasetError(
+            f"cannot write to {folder}: {error}", remedy="name another folder with --out"
+        ) from error
+
+
 def write_report(folder: Path, report: ForceReport, *, command: str) -> None:
-    """Write ``force-real.md``, ``.json`` and ``.png``: numbers and a figure, no rows."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write ``force-real.md``, ``.json`` and ``.png``: numbers and a figure, no rows.
+
+    Raises:
+        DatasetError: The disk refused; no file is left half written.
+    """
     draw_force(folder / "force-real.png", report.panels)
     write_json(folder / "force-real.json", report.results, {"command": command, **report.facts})
-    (folder / "force-real.md").write_text(
-        "# Force on two real BioTacs\n\n"
-        f"Made by `{command}`.\n\n{_PREFACE}\n"
-        + force_table(report.results)
-        + "\nIn brackets: 95 % interval, whole blocks resampled. `/ std`: over the standard"
-        " deviation of the true magnitude; `/ norm`: over the row's true magnitude.\n\n"
-        "![truth against estimate](force-real.png)\n",
-        encoding="utf-8",
-    )
+    with written_whole(folder / "force-real.md") as part:
+        part.write_text(
+            "# Force on two real BioTacs\n\n"
+            f"Made by `{command}`.\n\n{_PREFACE}\n"
+            + force_table(report.results)
+            + "\nIn brackets: 95 % interval, whole blocks resampled. `/ std`: over the standard"
+            " deviation of the true magnitude; `/ norm`: over the row's true magnitude.\n\n"
+            "![truth against estimate](force-real.png)\n",
+            encoding="utf-8",
+        )
 
 
 Floats = npt.NDArray[np.float32] | npt.NDArray[np.float64]

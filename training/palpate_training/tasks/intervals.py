@@ -33,7 +33,7 @@ from palpate_training.learning.field_code import in_parts
 from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
 from palpate_training.learning.metrics import field_errors, force_errors, join, location_errors
 from palpate_training.learning.ranges import UNLIKE, holds_known, places_of, with_pattern
-from palpate_training.tasks.evaluate import answers_of, read_features
+from palpate_training.tasks.evaluate import answers_of, learned_from, read_features
 from palpate_training.tasks.fields import tared_counts
 
 Floats = npt.NDArray[np.float64]
@@ -156,9 +156,7 @@ def add_intervals(
     found = joined([one.rows for one in sets])
     presses = len(np.unique(found.press))
     for path, one in zip(held_out, sets, strict=True):
-        if one.sha256 == manifest.training_data_sha256 or holds_known(
-            bundle.known_inputs, one.rows.tared
-        ):
+        if one.sha256 in learned_from(manifest) or holds_known(bundle.known_inputs, one.rows.tared):
             raise DatasetError(
                 f"{old} was trained on presses of {path}",
                 remedy="take presses that no training has seen",

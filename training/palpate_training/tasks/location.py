@@ -32,7 +32,12 @@ from palpate_training.learning.export import (
 from palpate_training.learning.metrics import join, location_errors, rms
 from palpate_training.learning.ranges import holds_known
 from palpate_training.learning.splits import by_group
-from palpate_training.tasks.evaluate import answers_of, read_features
+from palpate_training.tasks.evaluate import (
+    LOCATION_DATA,
+    answers_of,
+    learned_from,
+    read_features,
+)
 from palpate_training.tasks.features import contact_report
 
 Floats = npt.NDArray[np.float64]
@@ -98,8 +103,11 @@ def correct_location(
         raise BundleError(
             f"{old} gives no contact location", remedy="take a features bundle that does"
         )
-    presses, sources = _read(exact, manifest.contact_threshold_n)
-    if bundle.known_inputs is not None and holds_known(bundle.known_inputs, presses.tared):
+    presses, sources, digests = _read(exact, manifest.contact_threshold_n)
+    learned = learned_from(manifest)
+    if not learned.isdisjoint(digests) or (
+        bundle.known_inputs is not None and holds_known(bundle.known_inputs, presses.tared)
+    ):
         raise DatasetError(
             f"{old} was trained on presses of {', '.join(map(str, exact))}",
             remedy="take presses that no training has seen",
@@ -159,6 +167,12 @@ def correct_location(
         manifest=replace(
             manifest,
             metrics=metrics,
+            normalisation={
+                **manifest.normalisation,
+                LOCATION_DATA: " ".join(
+                    sorted(learned - {manifest.training_data_sha256} | digests)
+                ),
+            },
             intervals=bounds,
             trained_on=f"{manifest.trained_on}; its location then freed of registration errors by"
             f" {len(np.unique(presses.press))} presses of {'; '.join(sources)}",
@@ -170,11 +184,13 @@ def correct_location(
     return LocationReport(digest, before, after)
 
 
-def _read(exact: Sequence[Path], threshold_n: float) -> tuple[_Presses, list[str]]:
-    """Rows in contact of all data sets, and where they come from."""
+def _read(exact: Sequence[Path], threshold_n: float) -> tuple[_Presses, list[str], set[str]]:
+    """Rows in contact of all data sets, where they come from, and their digests."""
     parts, sensors, sources, first = [], [], [], 0
+    digests: set[str] = set()
     for path in exact:
-        data, about, _ = read_features(path)
+        data, about, digest = read_features(path)
+        digests |= {digest, data.content_sha256()}  # of a mixed file, and of its features
         if data.contact_location is None:
             raise DatasetError(f"{path} has no contact locations", remedy="take one that has")
         rows = np.flatnonzero(
@@ -199,7 +215,7 @@ def _read(exact: Sequence[Path], threshold_n: float) -> tuple[_Presses, list[str
                 f" finger, {PRESSES_LEAST} are needed",
                 remedy="simulate more",
             )
-    return _Presses(tared, location, press.astype(np.int32), group), sources
+    return _Presses(tared, location, press.astype(np.int32), group), sources, digests
 
 
 def _locations(bundle: Bundle, tared: FloatArray) -> FloatArray:

@@ -17,11 +17,11 @@ import numpy as np
 from palpate.errors import DatasetError
 from palpate.files.hdf5 import add_array
 from palpate_training.datasets.features import FeatureDataset, of_sensor
+from palpate_training.datasets.ingest import PRESS_N
 from palpate_training.learning.export import refuse_existing
 from palpate_training.learning.force_process import Floats, KnownRows
 from palpate_training.learning.other_fingers import OtherFinger, OtherFingers
 from palpate_training.tasks.finger import (
-    PRESS_N,
     FingerReport,
     HeldOutPresses,
     estimate_of,

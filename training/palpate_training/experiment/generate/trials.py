@@ -10,9 +10,8 @@ import io
 import pickle
 import tempfile
 import threading
-import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
+from palpate_training.datasets.container import read_archive
 from palpate_training.datasets.processing import from_half_newton, tare
 from palpate_training.datasets.trials import TrialHeader, TrialRows, reason_of
 from palpate_training.experiment.clearance import pad_poses, simulate_registrations
@@ -123,12 +123,12 @@ def read_trials(folder: Path, name: str) -> TrialsDone:
         DatasetError: The file is damaged; names it.
     """
     path = file_of(folder, name)
+    remedy = "remove it and run the command again"
+    arrays = read_archive(path, list, remedy=remedy)
     try:
-        return unpack(path.read_bytes())
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise DatasetError(
-            f"{path} is damaged: {error}", remedy="remove it and run the command again"
-        ) from error
+        return unpack(arrays)
+    except (ValueError, KeyError) as error:
+        raise DatasetError(f"{path} is damaged: {error}", remedy=remedy) from error
 
 
 def file_of(folder: Path, name: str) -> Path:
@@ -338,23 +338,22 @@ def pack(done: TrialsDone) -> bytes:
     return buffer.getvalue()
 
 
-def unpack(data: bytes) -> TrialsDone:
-    """Inverse of `pack`."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as file:
-        rows = tuple(
-            TrialRows(
-                header=TrialHeader(*(str(word) for word in header)),
-                **{key: file[f"{i}/{key}"] for key in ROW_ARRAYS},
-            )
-            for i, header in enumerate(file["rows"])
+def unpack(arrays: Mapping[str, NDArray[Any]]) -> TrialsDone:
+    """Inverse of `pack`, of the arrays that it wrote."""
+    rows = tuple(
+        TrialRows(
+            header=TrialHeader(*(str(word) for word in header)),
+            **{key: arrays[f"{i}/{key}"] for key in ROW_ARRAYS},
         )
-        return TrialsDone(
-            name=str(file["name"]),
-            rows=rows,
-            dropped=tuple((str(unit), str(why)) for unit, why in file["dropped"]),
-            counts={str(unit): file[f"counts/{unit}"] for unit in file["units"]},
-            believed=int(file["believed"]),
-        )
+        for i, header in enumerate(arrays["rows"])
+    )
+    return TrialsDone(
+        name=str(arrays["name"]),
+        rows=rows,
+        dropped=tuple((str(unit), str(why)) for unit, why in arrays["dropped"]),
+        counts={str(unit): arrays[f"counts/{unit}"] for unit in arrays["units"]},
+        believed=int(arrays["believed"]),
+    )
 
 
 def _executed_by(
