@@ -59,7 +59,7 @@ def parity(
     graph: FeaturesGraph, model: bytes, inputs: np.ndarray[Any, np.dtype[np.float32]]
 ) -> float:
     names = [tensor.name for tensor in graph.outputs]
-    return check_parity(graph, model, "electrodes", names, inputs, features_scale(graph))
+    return check_parity(graph, model, "electrodes", names, inputs, features_scale(graph, inputs))
 
 
 def rows(count: int = 16) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
@@ -131,6 +131,18 @@ def test_a_model_that_differs_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(BundleError):
         write(tmp_path / "b", graph)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_normal_is_as_exact_as_the_vector_that_it_is_made_of() -> None:
+    """Where networks disagree their mean is short, and a unit vector of it doubles its rounding."""
+    graph, other = make_graph(), make_graph()
+    with torch.no_grad():
+        other.net.get_buffer("output_mean")[9:] += 3e-6
+    with torch.inference_mode():
+        given = torch.from_numpy(rows())
+        normal, shifted = graph(given)[6], other(given)[6]
+    assert (normal - shifted).abs().max() > export.PARITY_MAX
+    assert parity(graph, to_onnx(other), rows()) < export.PARITY_MAX
 
 
 def test_a_model_that_is_not_one_is_refused() -> None:

@@ -84,9 +84,9 @@ def export_features(
 ) -> bytes:
     """Write a ``features`` bundle, or nothing.
 
-    A force may differ by 1e-5 N, a normal by 1e-5, a location by 1e-5 of the training targets'
-    standard deviation (1e-5 m would be no demand), and an answer larger than one of these units
-    relative to itself.
+    A force may differ by 1e-5 N, a normal by 1e-5 before it is made a unit vector, a location by
+    1e-5 of the training targets' standard deviation (1e-5 m would be no demand), and an answer
+    larger than one of these units relative to itself.
 
     Args:
         folder: Folder of the bundle; must not exist.
@@ -109,27 +109,37 @@ def export_features(
         size=(_RANDOM_ROWS, golden_inputs.shape[1]),
     )
     golden_inputs = np.ascontiguousarray(golden_inputs, dtype=np.float32)
+    inputs = np.vstack([golden_inputs, random.astype(np.float32)])
     return _export(
         folder,
         graph,
         "features",
         TASKS["features"].inputs,
         graph.outputs,
-        np.vstack([golden_inputs, random.astype(np.float32)]),
+        inputs,
         golden_inputs,
-        features_scale(graph),
+        features_scale(graph, inputs),
         contact_threshold_n=contact_threshold_n,
         **described,
     )
 
 
-def features_scale(graph: FeaturesGraph) -> Allowed:
-    """What differences of the ``features`` task are divided by."""
-    scales = [1.0, 1.0]
+def features_scale(graph: FeaturesGraph, inputs: FloatArray) -> Allowed:
+    """What differences of the ``features`` task are divided by, for its answers to ``inputs``."""
+    scales: list[FloatArray | float] = [1.0, 1.0]
     if graph.names:
         sd = graph.net.output_sd.reshape(-1, 3)  # type: ignore[operator]
-        for name, spread in zip(graph.names, sd[1:], strict=True):
-            scales += 2 * [1.0 if name == "contact_normal" else float(spread.max())]
+        with torch.inference_mode():
+            contact = graph.net(torch.from_numpy(inputs)).numpy()[:, 3:]
+        for name, spread, estimate in zip(
+            graph.names, sd[1:], np.split(contact, len(graph.names), axis=1), strict=True
+        ):
+            if name == "contact_normal":
+                # Made a unit vector of a shorter one, whose rounding grows with it.
+                length = np.linalg.norm(estimate, axis=1, keepdims=True)
+                scales += [1.0 / np.clip(length, 1e-12, 1.0), 1.0]
+            else:
+                scales += 2 * [float(spread.max())]
     # float32 resolves relative to the value: 30 N cannot be as exact as 1 N.
     return lambda i, right: np.maximum(scales[i], np.linalg.norm(right, axis=1, keepdims=True))
 
