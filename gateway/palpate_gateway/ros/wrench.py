@@ -66,7 +66,7 @@ class RosWrench(WrenchDevice, RosDevice):
     """A force/torque sensor behind a topic.
 
     ROS has no common way to take its zero in the device, so this driver subtracts it: the zero is
-    lost with the gateway, and with the publisher, and the sensor's range is not used better.
+    lost with the publisher, and the sensor's range is not used better.
     """
 
     options_class = RosWrenchOptions
@@ -105,6 +105,14 @@ class RosWrench(WrenchDevice, RosDevice):
                 remedy="check its driver: ros2 topic echo",
             )
         self._offset, self._zeroed = mean, self._topic.publisher
+
+    def _zero_note(self) -> bytes:
+        return self._offset.tobytes() + (self._zeroed or b"")
+
+    def _resume_zero(self, note: bytes) -> None:
+        offset, publisher = note[: self._offset.nbytes], note[self._offset.nbytes :]
+        if publisher:
+            self._offset, self._zeroed = np.frombuffer(offset), publisher
 
     def _keeps_zero(self) -> bool:
         return self._same_publisher
