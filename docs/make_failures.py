@@ -72,7 +72,7 @@ SENSOR_STATES = {
         "Wait; tare again when it is `LIVE`.",
     ),
     SensorState.ZERO_LOST: (
-        "A force/torque sensor was opened again, and its zero may be gone.",
+        "A force/torque sensor was opened again, or refused a new zero: its own may be gone.",
         "Unload it and `palpate tare NAME`.",
     ),
     SensorState.LOST: (

@@ -20,6 +20,7 @@ _LOOK_S = 0.2
 _LOG_AGAIN_S = 60.0
 """A sensor that stays away is logged again after this time only [s]: attempts follow closely."""
 
+_ZERO_LOST = "the zero that it had may be gone: it was opened again, or refused a new one"
 _ZERO_REMEDY = "when nothing touches the BioTac, take its zero again: palpate tare {name}"
 
 
@@ -55,7 +56,7 @@ class SensorReport:
         self.is_wrong = zero_lost or (condition is not None and condition.has_wrong_channel)
         if zero_lost:
             state = SensorState.ZERO_LOST
-            message = "it was opened again: the zero that it had may be gone"
+            message = _ZERO_LOST
         elif condition is not None and condition.warm_up.warming:
             state = SensorState.WARMING
         else:
@@ -139,7 +140,7 @@ class SensorReport:
     def _report_zero(self, *, zero_lost: bool) -> None:
         if zero_lost and not self._zero_lost:
             error = DeviceError(
-                f"sensor {self._name!r} was opened again: the zero that it had may be gone",
+                f"sensor {self._name!r}: {_ZERO_LOST}",
                 remedy=_ZERO_REMEDY.format(name=self._name),
             )
             self._health.fail(error)

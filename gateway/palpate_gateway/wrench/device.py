@@ -143,7 +143,8 @@ class WrenchDevice(Device):
         self.zero_limits = options
         """Limits of the standard deviation for a zero on request."""
         self.zero_lost = False
-        """Whether its zero may be lost: it was opened again and does not report a zero."""
+        """Whether its zero may be lost: it was opened again and does not report a zero, or it
+        refused a new one and has given up the old one."""
         self._has_zero = False
         self._zero_at_start = options.zero_at_start
         self._keep_note: Callable[[bytes], None] = lambda note: None
@@ -173,6 +174,12 @@ class WrenchDevice(Device):
         self._has_zero, self.zero_lost = True, False
         self._counts["zeros"] += 1
         self._keep_note(self._zero_note())
+
+    def _lose_zero(self) -> None:
+        """The zero that it has taken, if any, may be gone."""
+        if self._has_zero:
+            self._has_zero, self.zero_lost = False, True
+            self._counts["zero_lost"] += 1
 
     def keep_zero(self, keep: Callable[[bytes], None], note: bytes | None) -> None:
         """Note each zero for a gateway that is started again; call it before the first opening.
@@ -217,10 +224,9 @@ class WrenchDevice(Device):
             if self._zero_at_start:
                 self.take_zero()
                 self._zero_at_start = False
-            elif self._has_zero and not self._keeps_zero():
+            elif not self._keeps_zero():
                 # No known product stores its zero: a sensor that was without power has lost it.
-                self._has_zero, self.zero_lost = False, True
-                self._counts["zero_lost"] += 1
+                self._lose_zero()
         except BaseException:
             self._close()
             raise
