@@ -64,7 +64,9 @@ class DeviceIdentity:
         start_wall_ns: Wall clock at device time zero of a recording [ns since the epoch]; None =
             unknown, or live.
         sensor_type: Kind of tactile sensor, if only the open device shows it; replaces that of
-            ``DeviceInfo``, and the nominal rate with it; None = as in ``DeviceInfo``.
+            ``DeviceInfo``, and the nominal rate with it; None = both as in ``DeviceInfo``.
+        rate_hz: Nominal frame rate [Hz] with ``sensor_type``; None = its frames follow one another
+            without a pause.
         has_clock: The device has a clock of its own, and its readings carry that time; False = a
             live device without one: times are the host's monotonic times of arrival.
     """
@@ -73,6 +75,7 @@ class DeviceIdentity:
     slot_period_s: float
     start_wall_ns: int | None = None
     sensor_type: SensorType | None = None
+    rate_hz: float | None = None
     has_clock: bool = True
 
 
@@ -151,8 +154,9 @@ class Device(ABC):
             identity = self._open()
             identity = self._identity = replace(identity, serial=_fit_for_wire(identity.serial))
             kind = identity.sensor_type
-            if kind is not None and kind is not self._info.sensor_type:
-                rate_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
+            if kind is not None:
+                slots_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
+                rate_hz = slots_hz if identity.rate_hz is None else identity.rate_hz
                 self._info = replace(self._info, sensor_type=kind, rate_hz=rate_hz)
 
     def close(self) -> None:

@@ -263,7 +263,13 @@ class RosBag(FileDevice):
         if not first.whole_frames:
             period_s = 1.0 / (options.rate_hz * kind.layout.slots)
         serial = options.serial or finger.serial or f"{options.path.stem}-{options.finger}"
-        return DeviceIdentity(serial, period_s, start_wall_ns=origin_ns, sensor_type=kind)
+        return DeviceIdentity(
+            serial,
+            period_s,
+            start_wall_ns=origin_ns,
+            sensor_type=kind,
+            rate_hz=options.rate_hz,
+        )
 
     def _first(self, bag: RosBagFile, topic: str) -> tuple[RosHand, RosFinger]:
         """The first message with the finger."""

@@ -134,7 +134,9 @@ class RosBiotac(RosDevice):
         serial = self._options.serial or finger.serial or f"{name}-{self._options.finger}"
         self._serial = finger.serial
         self._kind = kind
-        return DeviceIdentity(serial, period_s, sensor_type=kind)
+        # Its driver may publish fewer frames than slots would make.
+        rate_hz = self._options.rate_hz
+        return DeviceIdentity(serial, period_s, sensor_type=kind, rate_hz=rate_hz)
 
     def _close(self) -> None:
         self._topic.close()

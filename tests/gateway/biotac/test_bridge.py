@@ -12,6 +12,7 @@ from tests.gateway.reading_devices import PATIENCE_S, open_again, read_frames
 
 from palpate.config import parse_config
 from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate.messages import ServiceState
 from palpate_gateway.biotac.bridge import BiotacBridge, BridgeOptions
 from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator, stuffed
 from palpate_gateway.emulators.biotac_slots import idle_counts
@@ -98,6 +99,16 @@ def test_a_slower_bridge_tells_its_rate(emulate: Emulate, finger: FingerQueue) -
     assert device.identity.slot_period_s == pytest.approx(1 / 2200)
     times = np.diff([one.time_s for one in read_frames(device, lambda got: len(got) > 10)])
     assert np.median(times) == pytest.approx(0.02, abs=1e-6)
+    assert device.info.rate_hz == pytest.approx(50.0)
+
+
+def test_a_slow_finger_is_not_silent_between_its_frames(bus: Any, emulate: Emulate) -> None:
+    options = {"line": emulate(slot_rate_hz=1000.0, fingers=1).address}
+    slow = {"name": "slow", "driver": "biotac_bridge", "options": options}
+    with bus.gateway({"sensors": [slow]}):
+        bus.state(ServiceState.READY)
+        now = bus.until(lambda: (s := bus.status()) and s.counters["frames_published"] > 50 and s)
+    assert now.counters.get("silences", 0) < 10
 
 
 def wait_for_packets(emulator: BiotacBridgeEmulator, count: int) -> None:
