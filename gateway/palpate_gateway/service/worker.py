@@ -182,6 +182,8 @@ class SensorWorker:
         )
         self._counters: Counter[str] = Counter()
         self._device_counters: Counter[str] = Counter()
+        self._added = False
+        """Whether these hold those of the device, which keeps them until it is opened again."""
         self._report = SensorReport(name, health)
         self._wrench = device if isinstance(device, WrenchDevice) else None
         self.zeroing = None if self._wrench is None else Zeroing(name, self._wrench)
@@ -205,10 +207,11 @@ class SensorWorker:
 
     def counters(self) -> dict[str, int]:
         """Everything counted for this sensor since the start."""
-        device = self._device_counters + Counter(self.device.counters)
+        present = self.device.counters
+        device = self._device_counters + Counter({} if self._added else present)
         device.pop("frames", None)  # the pipeline counts what was published
         # The pipeline counts the missing frames of every device; adding Counters drops zeros.
-        zeros = dict.fromkeys(self.device.counters.keys() - {"frames"}, 0)
+        zeros = dict.fromkeys(present.keys() - {"frames"}, 0)
         own = self._counters + self._publisher.counters
         if self._clock_map is not None:
             own += Counter(self._clock_map.counters)
@@ -274,6 +277,7 @@ class SensorWorker:
             self._turns.next(LATE_S)
             try:
                 self.device.open()
+                self._added = False
                 self._key.opened(self.device.identity.serial)
                 if self._clock_map is not None:
                     self._counters += Counter(self._clock_map.counters)
@@ -299,7 +303,9 @@ class SensorWorker:
                 self._counters["device_lost"] += 1
                 self._report.is_lost(error, backoff_s)
                 self._give_up(error.problem)
-            self._device_counters += Counter(self.device.counters)
+            if not self._added:
+                self._device_counters += Counter(self.device.counters)
+                self._added = True
             self._turns.next(LATE_S)
             self.device.close()
             self._turns.next(inf)  # another gateway may hold the key for as long as it likes

@@ -93,6 +93,35 @@ def test_three_fingers_of_one_line(
         assert times.min() > 0.0
 
 
+def test_what_others_of_the_line_counted_before_is_not_counted(
+    emulate: Emulate, finger: FingerQueue
+) -> None:
+    emulator = emulate(fingers=2)
+    first, second = finger(emulator.address), finger(emulator.address, port=2)
+    first.open()
+    for _ in range(2):
+        read_frames(first, lambda got: len(got) > 20)
+        before = first.counters["packets"]
+        second.open()
+        read_frames(second, lambda got: len(got) > 2)
+        since = second.counters["packets"]
+        assert 0 < since <= first.counters["packets"] - before
+        second.close()
+
+
+def test_an_opening_that_fails_brings_no_old_counts(emulate: Emulate, finger: FingerQueue) -> None:
+    emulator = emulate()
+    device = finger(emulator.address)
+    device.open()
+    read_frames(device, lambda got: len(got) > 2)
+    device.close()
+    assert device.counters["samples"] > 0
+    emulator.stop()
+    with pytest.raises(DeviceError):
+        device.open()
+    assert device.counters["samples"] == 0
+
+
 def test_a_slower_bridge_tells_its_rate(emulate: Emulate, finger: FingerQueue) -> None:
     device = finger(emulate(slot_rate_hz=2200.0, fingers=1).address)
     device.open()
