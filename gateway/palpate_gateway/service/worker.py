@@ -203,7 +203,8 @@ class SensorWorker:
 
     def join(self, timeout_s: float) -> None:
         """Wait for the thread's end; ``stop`` must be set or the source finite."""
-        self._thread.join(timeout_s)
+        if self._thread.ident is not None:  # else it was never started
+            self._thread.join(timeout_s)
 
     def counters(self) -> dict[str, int]:
         """Everything counted for this sensor since the start."""
