@@ -242,7 +242,8 @@ class RosBag(FileDevice):
     @property
     def counters(self) -> Mapping[str, int]:
         """Readings, messages that are none, and what could not be decoded."""
-        return {**self._track.counters, **self._counts}
+        jumps = self._track.counters["time_jumps"] + self._counts["time_jumps"]
+        return {**self._track.counters, **self._counts, "time_jumps": jumps}
 
     def _open(self) -> DeviceIdentity:
         options = self._options
