@@ -75,6 +75,14 @@ def test_rebuilt_time_leaves_room_for_missing_frames(
     assert [r.missed_before for r in readings] == [0, 0, 2, 0]
 
 
+def test_a_damaged_frame_number_moves_no_time(log: Callable[..., Any], tmp_path: Path) -> None:
+    path = log(style="log", frame_numbers=[1, 2, 100_000_003, 4, 5]).write(tmp_path / "a")
+    readings, device, _ = replay(path)
+    assert np.allclose([r.time_s for r in readings], [0.0, 0.01, 0.02, 0.03, 0.04])
+    assert device.counters["missing_frames"] == 0
+    assert device.counters["counter_restarts"] == 2
+
+
 @pytest.mark.parametrize("block_bytes", [1, 700, 5000])
 def test_blocks_do_not_matter(log: Callable[..., Any], tmp_path: Path, block_bytes: int) -> None:
     path = log().write(tmp_path / "a.btd", gz=True)
