@@ -124,7 +124,9 @@ class FingerDevice(Device):
         before = self._line_before
         line = finger.source.counters(finger.index).items()
         since = {name: count - before.get(name, 0) for name, count in line}
-        return {**since, **self._assembler.counters, "dropped_slots": finger.dropped}
+        # Those of the line are exact where both have one: the assembler takes any bad word for a
+        # parity error, and sees no slot that the line has dropped.
+        return {**self._assembler.counters, **since, "dropped_slots": finger.dropped}
 
     def _open(self) -> DeviceIdentity:
         key, settings, source, ports = self._line()

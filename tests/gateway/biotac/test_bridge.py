@@ -109,6 +109,21 @@ def test_what_others_of_the_line_counted_before_is_not_counted(
         second.close()
 
 
+@pytest.mark.parametrize("fault", ["error_word", "parity"])
+def test_words_of_errors_are_no_parity_errors(
+    emulate: Emulate, finger: FingerQueue, fault: str
+) -> None:
+    emulator = emulate()
+    device = finger(emulator.address)
+    device.open()
+    emulator.inject(fault, 60.0)
+    read_frames(device, lambda got: len(got) > 10 and got[-1].validity != ALL_VALID)
+    found = {name for name, count in device.counters.items() if count}
+    told = {name for name in found if name == "parity_errors" or name.startswith("device_error")}
+    assert ("parity_errors" in told) == (fault == "parity")
+    assert len(told) == 1
+
+
 def test_an_opening_that_fails_brings_no_old_counts(emulate: Emulate, finger: FingerQueue) -> None:
     emulator = emulate()
     device = finger(emulator.address)
