@@ -103,7 +103,7 @@ class Pipeline:
 
     @property
     def tare_error(self) -> DeviceError | None:
-        """Why the last attempt to tare failed; None after a success."""
+        """Why the sensor is not tared, or not again without a request; None after a success."""
         return self._tares.error
 
     def begin(self, identity: DeviceIdentity, clock: ClockMap) -> None:

@@ -113,10 +113,11 @@ class SensorReport:
             if self._refused is not None:
                 self._health.over(self._refused)
             self._refused = None
-        elif self._refused is None:
-            self._refused = error
+        elif self._refused is None or error.problem != self._refused.problem:
             self._health.fail(error, degraded=False)
-            _log.warning("sensor %s: %s", self._name, error, extra=about(self._name))
+            if self._refused is None:  # attempts follow closely
+                _log.warning("sensor %s: %s", self._name, error, extra=about(self._name))
+            self._refused = error
 
     def _set_state(
         self, state: SensorState, faults: tuple[ChannelFault, ...] = (), message: str = ""
