@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -98,3 +99,18 @@ def test_a_device_that_is_away_counts_nothing_again(worker: SensorWorker) -> Non
     assert worker.device.seen == [0] + [FRAMES] * ATTEMPTS + [2 * FRAMES]
     counters = worker.counters()
     assert (counters["samples"], counters["never"]) == (2 * FRAMES, 0)
+
+
+class Busy(Counter[str]):
+    """Its thread counts something new while another one looks through it."""
+
+    def items(self) -> Iterator[tuple[str, int]]:  # type: ignore[override]
+        for item in super().items():
+            self[f"new {len(self)}"] += 1
+            yield item
+
+
+@pytest.mark.parametrize("name", ["_counters", "_device_counters"])
+def test_they_are_told_while_something_new_is_counted(worker: SensorWorker, name: str) -> None:
+    setattr(worker, name, Busy(silences=1))
+    assert worker.counters()["silences"] == 1

@@ -208,12 +208,13 @@ class SensorWorker:
 
     def counters(self) -> dict[str, int]:
         """Everything counted for this sensor since the start."""
-        present = self.device.counters
-        device = self._device_counters + Counter({} if self._added else present)
+        # Copies: other threads count new events while the counters are added.
+        present = dict(self.device.counters)
+        device = Counter(self._device_counters) + Counter({} if self._added else present)
         device.pop("frames", None)  # the pipeline counts what was published
         # The pipeline counts the missing frames of every device; adding Counters drops zeros.
         zeros = dict.fromkeys(present.keys() - {"frames"}, 0)
-        own = self._counters + self._publisher.counters
+        own = Counter(self._counters) + Counter(self._publisher.counters)
         if self._clock_map is not None:
             own += Counter(self._clock_map.counters)
         return {**zeros, **device, **own, **self.pipeline.counters}
