@@ -20,7 +20,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar, Self, TypeVar
 
 from pydantic import AfterValidator
 
@@ -28,6 +28,8 @@ from palpate.config import LinkConfig, StrictConfig
 from palpate.errors import DeviceError, RecordingError
 from palpate.messages import Origin, SensorType
 from palpate_gateway.readings import Reading
+
+SomeReading = TypeVar("SomeReading", bound=Reading)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +122,7 @@ class Device(ABC):
     def __init__(self, info: DeviceInfo) -> None:
         self._info = info
         self._identity: DeviceIdentity | None = None
+        self._held_error: DeviceError | None = None
 
     @property
     def info(self) -> DeviceInfo:
@@ -151,6 +154,7 @@ class Device(ABC):
             DeviceError: The device or file cannot be opened or is not what it should be.
         """
         if self._identity is None:
+            self._held_error = None
             identity = self._open()
             identity = self._identity = replace(identity, serial=_fit_for_wire(identity.serial))
             kind = identity.sensor_type
@@ -172,7 +176,22 @@ class Device(ABC):
             timeout_s: How long to wait for the first reading [s].
         """
         _ = self.identity  # raises if the device is closed
+        if self._held_error is not None:
+            raise self._held_error
         return self._read(timeout_s)
+
+    def _before_error(self, readings: Iterable[SomeReading | None]) -> list[SomeReading]:
+        """All of them up to an error, which the next ``read`` raises; at once if there are none."""
+        good: list[SomeReading] = []
+        try:
+            for reading in readings:
+                if reading is not None:
+                    good.append(reading)
+        except DeviceError as error:
+            if not good:
+                raise
+            self._held_error = error
+        return good
 
     @property
     @abstractmethod

@@ -147,10 +147,9 @@ class RosBiotac(RosDevice):
             early, self._early = self._early, None
             left_s = max(until - time.monotonic(), 0.0)
             messages = self._topic.take(left_s) if early is None else [early]
-            readings: list[Reading] = []
-            readings += [one for message in messages if (one := self._reading(message))]
+            readings = self._before_error(self._reading(message) for message in messages)
             if readings:
-                return readings
+                return list(readings)
             if time.monotonic() >= until:
                 raise DeviceTimeout(
                     f"{self.info.model}: no new reading within {timeout_s:g} s",

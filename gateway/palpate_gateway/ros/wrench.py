@@ -136,7 +136,7 @@ class RosWrench(WrenchDevice, RosDevice):
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
         early, self._early = self._early, None
         messages = self._topic.take(timeout_s) if early is None else [early]
-        return [reading for one in messages if (reading := self._take(one)) is not None]
+        return self._before_error(self._take(one) for one in messages)
 
     def _take(self, message: RosMessage[RosWrenchMessage]) -> WrenchReading | None:
         time_ns = message.message.time_ns or message.sent_ns or message.arrival_ns

@@ -199,7 +199,7 @@ class WrenchBota(WrenchDevice):
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
         frames = self._unless_silent(self._frames, timeout_s, _SILENCE_S)
-        return [reading for frame in frames if (reading := self._take(frame)) is not None]
+        return self._before_error(self._take(frame) for frame in frames)
 
     def _frames(self, timeout_s: float) -> list[BotaFrame]:
         data, self._early = self._early, b""
