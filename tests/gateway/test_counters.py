@@ -99,6 +99,7 @@ def test_a_device_that_is_away_counts_nothing_again(worker: SensorWorker) -> Non
     assert worker.device.seen == [0] + [FRAMES] * ATTEMPTS + [2 * FRAMES]
     counters = worker.counters()
     assert (counters["samples"], counters["never"]) == (2 * FRAMES, 0)
+    assert counters["device_lost"] == 1, "attempts that fail lose nothing"
 
 
 class Busy(Counter[str]):

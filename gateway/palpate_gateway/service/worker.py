@@ -301,8 +301,8 @@ class SensorWorker:
                     raise
                 if self.serving:
                     backoff_s = BACKOFF_S[0]
+                    self._counters["device_lost"] += 1
                 self.serving = self.silent = False
-                self._counters["device_lost"] += 1
                 self._report.is_lost(error, backoff_s)
                 self._give_up(error.problem)
             if not self._added:
