@@ -79,7 +79,10 @@ SENSOR_STATES = {
         "It is silent, or gone.",
         "Check cable and power; the gateway finds it again by itself.",
     ),
-    SensorState.ENDED: ("A recording is over, or has failed.", "-"),
+    SensorState.ENDED: (
+        "A recording is over, or has failed; or a live sensor's options do not fit its device.",
+        "See `last_error`.",
+    ),
 }
 FAULTS = {
     FaultKind.UNKNOWN: ("The fault comes from a newer palpate.", "Upgrade this host."),
