@@ -72,14 +72,17 @@ SENSOR_STATES = {
         "Wait; tare again when it is `LIVE`.",
     ),
     SensorState.ZERO_LOST: (
-        "A force/torque sensor was opened again, and its zero may be gone.",
+        "A force/torque sensor was opened again, or refused a new zero: its own may be gone.",
         "Unload it and `palpate tare NAME`.",
     ),
     SensorState.LOST: (
         "It is silent, or gone.",
         "Check cable and power; the gateway finds it again by itself.",
     ),
-    SensorState.ENDED: ("A recording is over, or has failed.", "-"),
+    SensorState.ENDED: (
+        "A recording is over, or has failed; or a live sensor's options do not fit its device.",
+        "See `last_error`.",
+    ),
 }
 FAULTS = {
     FaultKind.UNKNOWN: ("The fault comes from a newer palpate.", "Upgrade this host."),

@@ -20,7 +20,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar, Self, TypeVar
 
 from pydantic import AfterValidator
 
@@ -28,6 +28,8 @@ from palpate.config import LinkConfig, StrictConfig
 from palpate.errors import DeviceError, RecordingError
 from palpate.messages import Origin, SensorType
 from palpate_gateway.readings import Reading
+
+SomeReading = TypeVar("SomeReading", bound=Reading)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +66,9 @@ class DeviceIdentity:
         start_wall_ns: Wall clock at device time zero of a recording [ns since the epoch]; None =
             unknown, or live.
         sensor_type: Kind of tactile sensor, if only the open device shows it; replaces that of
-            ``DeviceInfo``, and the nominal rate with it; None = as in ``DeviceInfo``.
+            ``DeviceInfo``, and the nominal rate with it; None = both as in ``DeviceInfo``.
+        rate_hz: Nominal frame rate [Hz] with ``sensor_type``; None = its frames follow one another
+            without a pause.
         has_clock: The device has a clock of its own, and its readings carry that time; False = a
             live device without one: times are the host's monotonic times of arrival.
     """
@@ -73,6 +77,7 @@ class DeviceIdentity:
     slot_period_s: float
     start_wall_ns: int | None = None
     sensor_type: SensorType | None = None
+    rate_hz: float | None = None
     has_clock: bool = True
 
 
@@ -117,6 +122,7 @@ class Device(ABC):
     def __init__(self, info: DeviceInfo) -> None:
         self._info = info
         self._identity: DeviceIdentity | None = None
+        self._held_error: DeviceError | None = None
 
     @property
     def info(self) -> DeviceInfo:
@@ -148,11 +154,13 @@ class Device(ABC):
             DeviceError: The device or file cannot be opened or is not what it should be.
         """
         if self._identity is None:
+            self._held_error = None
             identity = self._open()
             identity = self._identity = replace(identity, serial=_fit_for_wire(identity.serial))
             kind = identity.sensor_type
-            if kind is not None and kind is not self._info.sensor_type:
-                rate_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
+            if kind is not None:
+                slots_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
+                rate_hz = slots_hz if identity.rate_hz is None else identity.rate_hz
                 self._info = replace(self._info, sensor_type=kind, rate_hz=rate_hz)
 
     def close(self) -> None:
@@ -168,7 +176,22 @@ class Device(ABC):
             timeout_s: How long to wait for the first reading [s].
         """
         _ = self.identity  # raises if the device is closed
+        if self._held_error is not None:
+            raise self._held_error
         return self._read(timeout_s)
+
+    def _before_error(self, readings: Iterable[SomeReading | None]) -> list[SomeReading]:
+        """All of them up to an error, which the next ``read`` raises; at once if there are none."""
+        good: list[SomeReading] = []
+        try:
+            for reading in readings:
+                if reading is not None:
+                    good.append(reading)
+        except DeviceError as error:
+            if not good:
+                raise
+            self._held_error = error
+        return good
 
     @property
     @abstractmethod

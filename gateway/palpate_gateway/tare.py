@@ -199,7 +199,7 @@ class TareAttempts:
         self.ledger = TareLedger()
         self.counters: dict[str, int] = {"tares": 0, "tares_refused": 0}
         self.error: DeviceError | None = None
-        """Why the last attempt failed; None after a success."""
+        """Why the sensor is not tared, or not again without a request; None after a success."""
         self.frames = frames
         self._limits = limits
         self._distance = distance
@@ -314,7 +314,9 @@ class TareAttempts:
             if tare is not None and not anyway:
                 self._check_distance(tare)
         except DeviceError as error:
-            self.error = error
+            # Who asked is told, and the tare in force goes on.
+            if collector is self._own or self.ledger.current_id == NO_TARE:
+                self.error = error
             self.counters["tares_refused"] += 1
             return error
         if tare is not None:

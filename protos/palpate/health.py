@@ -369,6 +369,9 @@ class HealthReporter(Closing):
             except PalpateError as error:
                 if not self._stop.is_set():
                     _log.warning("status not published: %s", error)
+            except Exception:
+                # Without its status a process that works would seem to be gone.
+                _log.exception("status not published: defect")
             now_s = time.monotonic()
             allowance = min(_BURST, allowance + _CHANGES_HZ * (now_s - earned_s)) - 1.0
             earned_s = now_s

@@ -29,6 +29,24 @@ def test_a_sensor_that_stays_away_is_logged_once_for_each_reason(
     assert caplog.text.count("the line is gone") == 3
 
 
+def test_the_present_reason_of_a_refused_tare_is_told_and_the_first_is_logged(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    health = Health("gateway", "a")
+    report = SensorReport("thumb", health)
+    health.set_state(ServiceState.READY, "all sensors deliver")
+    for reason in ("E7 varies", "E7 varies", "PDC is invalid"):
+        report.tare_refused(DeviceError(reason, remedy="let go"))
+        now = health.status()
+        assert now.last_error is not None
+        assert (now.message, now.last_error.message) == (reason, reason)
+    assert [record.getMessage() for record in caplog.records] == [
+        "sensor thumb: E7 varies -> let go"
+    ]
+    report.tare_refused(None)
+    assert health.status().message == "all sensors deliver"
+
+
 def test_a_refused_tare_is_the_message_until_one_succeeds() -> None:
     health = Health("gateway", "a")
     report = SensorReport("thumb", health)

@@ -52,6 +52,19 @@ def tares(out: list[DueMessage]) -> list[Tare]:
     return [item.message for item in out if isinstance(item.message, Tare)]
 
 
+def test_a_request_that_is_refused_is_told_to_who_asked_while_a_tare_is_in_force() -> None:
+    made, finger = pipeline(), fakes.Finger()
+    push(made, finger.frames(1.0))
+    assert made.ledger.current_id != NO_TARE
+    finger.pac_noise = 22.0
+    asked = made.ask_tare(0)
+    push(made, finger.frames(1.0))
+    with pytest.raises(DeviceError, match="PAC varies"):
+        asked.result(0.0)
+    assert made.tare_error is None
+    assert made.counters["tares_refused"] == 1
+
+
 def test_still_waits_for_pac_to_be_quiet() -> None:
     """A hand that holds the finger: its electrodes are quiet enough, its pulse is not."""
     made, finger = pipeline(), fakes.Finger()

@@ -250,6 +250,28 @@ def test_without_messages_no_report_waits_for_ever(link: LinkConfig) -> None:
             states.next(PATIENCE_S)
 
 
+def test_a_defect_in_one_report_does_not_end_the_reports(
+    link: LinkConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    reports = 0
+
+    def refresh() -> None:
+        nonlocal reports
+        reports += 1
+        if reports == 2:
+            raise RuntimeError("dictionary changed size during iteration")
+
+    health = Health("features", "features")
+    with (
+        Session.open(link) as session,
+        HealthReporter(session, health, period_s=0.01, refresh=refresh),
+    ):
+        states = session.subscriber(STATUS, delivery=Delivery.QUEUE)
+        while reports < 3:
+            states.next(PATIENCE_S)
+    assert "changed size" in caplog.text
+
+
 def test_gauges_that_a_source_has_no_more_are_gone() -> None:
     health = Health("gateway", "gateway")
     health.gauge("wall_error_s", 0.1)

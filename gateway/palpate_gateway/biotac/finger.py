@@ -107,6 +107,7 @@ class FingerDevice(Device):
         )
         self._options = options
         self._finger: FingerQueue | None = None
+        self._line_before: Mapping[str, int] = {}
         self._early: SlotBlock | None = None
         self._assembler = FrameAssembler(1.0 / ch.SLOT_RATE_HZ)
 
@@ -120,8 +121,12 @@ class FingerDevice(Device):
         finger = self._finger
         if finger is None:
             return self._assembler.counters
-        line = finger.source.counters(finger.index)
-        return {**line, **self._assembler.counters, "dropped_slots": finger.dropped}
+        before = self._line_before
+        line = finger.source.counters(finger.index).items()
+        since = {name: count - before.get(name, 0) for name, count in line}
+        # Those of the line are exact where both have one: the assembler takes any bad word for a
+        # parity error, and sees no slot that the line has dropped.
+        return {**self._assembler.counters, **since, "dropped_slots": finger.dropped}
 
     def _open(self) -> DeviceIdentity:
         key, settings, source, ports = self._line()
@@ -130,7 +135,11 @@ class FingerDevice(Device):
             raise ConfigError(
                 f"{self.info.model}: the line has {ports} ports", remedy="correct port or fingers"
             )
-        self._finger = finger = SlotLink.join(key, settings, source, port - 1)
+        self._assembler = FrameAssembler(1.0 / ch.SLOT_RATE_HZ)  # its counters begin anew
+        finger = SlotLink.join(key, settings, source, port - 1)
+        # Other fingers may have the line open for long.
+        self._line_before = finger.source.counters(finger.index)
+        self._finger = finger
         try:
             self._early = self._wait_for_words(finger)
             kind = agreed_type(self._options.sensor_type, self._early, self.info.model)

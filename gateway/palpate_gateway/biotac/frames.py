@@ -14,7 +14,7 @@ from palpate_gateway.readings import ElectrodeReading
 TIME_JUMP_S = 1e-3
 """A slot that is later than its place on the slot grid by more is a time jump [s]."""
 
-_BELIEVABLE_LOSS = 1_000_000
+BELIEVABLE_LOSS = 1_000_000
 """A frame counter that jumps by more has restarted or is damaged [frames]."""
 
 _KNOWN = np.zeros(256, np.bool_)
@@ -273,7 +273,7 @@ class FrameAssembler:
             self._tick = max(frame, 0)
             return 0
         missed = frame - self._last_key[1] - 1
-        if not 0 <= missed <= _BELIEVABLE_LOSS:
+        if not 0 <= missed <= BELIEVABLE_LOSS:
             self.counters["counter_restarts"] += 1
             missed = 0
         self._last_key = (batch, frame)

@@ -127,8 +127,6 @@ class KernelStamps:
         self._doubt_until_ns = 0
         self._read_ns: int | None = None
         self._paused_ns = self._paused_until_ns = 0
-        self.refused = 0
-        """Number of implausible stamps."""
 
     def monotonic_ns(self, stamp_s: float, arrival_ns: int) -> int:
         """Host monotonic time of a stamp [ns], not later than the arrival.
@@ -138,18 +136,15 @@ class KernelStamps:
             arrival_ns: Host monotonic clock when it had been read [ns].
         """
         if not math.isfinite(stamp_s):
-            self.refused += 1
             return arrival_ns
         return self.monotonic_of_ns(round(stamp_s * 1e9), arrival_ns)
 
     def monotonic_of_ns(self, stamp_ns: int, arrival_ns: int) -> int:
         """As ``monotonic_ns``, for a stamp in [ns since the Unix epoch]."""
         if not self._trusted(arrival_ns):
-            self.refused += 1
             return arrival_ns
         received_ns = stamp_ns - self._wall.offset_ns
         if not -_EARLY_NS <= arrival_ns - received_ns <= self._oldest_ns(arrival_ns):
-            self.refused += 1
             return arrival_ns
         return min(received_ns, arrival_ns)
 
@@ -162,12 +157,10 @@ class KernelStamps:
         time is limited by the times of the messages behind it.
         """
         if not self._trusted(arrival_ns):
-            self.refused += len(stamps_ns)
             return np.full(len(stamps_ns), arrival_ns)
         received_ns = stamps_ns - self._wall.offset_ns
         waited_ns = arrival_ns - received_ns
         plausible = (waited_ns >= -_EARLY_NS) & (waited_ns <= self._oldest_ns(arrival_ns))
-        self.refused += int(len(plausible) - np.count_nonzero(plausible))
         came_ns = np.where(plausible, np.minimum(received_ns, arrival_ns), arrival_ns)
         return np.minimum.accumulate(came_ns[::-1])[::-1]
 

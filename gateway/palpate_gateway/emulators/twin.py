@@ -4,8 +4,7 @@ Each finger has a loop of indentations. The virtual finger (``virtual.tape``) co
 the start, with the same options and therefore the same counts; from then on it is only looked up.
 The host's clock plays a loop: the position in it is the time since an epoch, modulo its length. So
 emulators in several processes, started at different times on hosts whose clocks agree, play the
-same
-scene: two that have the same seed and trajectories measure the same finger.
+same scene: two that have the same seed and trajectories measure the same finger.
 
 Between two frames everything is linear; PAC takes the nearest of its own 2200 instants per second.
 """

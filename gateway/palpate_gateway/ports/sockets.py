@@ -174,8 +174,6 @@ class TcpPort(_SocketPort):
         link = socket.create_connection(self._address, timeout=CONNECT_S)
         link.settimeout(_WRITE_S)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # A device without power never closes its connection; keep-alive notices that.
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         return link
 
 

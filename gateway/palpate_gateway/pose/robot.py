@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from pydantic import Field
 
@@ -100,16 +100,27 @@ class PoseZenoh(BusDevice):
             session.close()
 
     def _read(self, timeout_s: float) -> list[Reading]:
+        readings = self._before_error(self._arrived(timeout_s))
+        if not readings:
+            raise DeviceLost(
+                f"the program of robot {self._options.robot!r} has restarted",
+                remedy="nothing, if that is right; if not, two programs use this name",
+            )
+        self._counts["samples"] += len(readings)
+        return list(readings)
+
+    def _arrived(self, timeout_s: float) -> Iterator[PoseReading]:
+        """The next readings, up to a restart; waits for the first one only."""
         assert self._subscriber is not None
         until = time.monotonic() + timeout_s
-        readings: list[Reading] = []
-        while len(readings) < _BATCH and not self._restarted:
-            left_s = 0.0 if readings else max(until - time.monotonic(), 0.0)
+        count = 0
+        while count < _BATCH and not self._restarted:
             try:
+                left_s = 0.0 if count else max(until - time.monotonic(), 0.0)
                 received = self._subscriber.next(left_s)
             except StreamTimeout as error:
-                if readings:
-                    break
+                if count:
+                    return
                 raise DeviceTimeout(
                     f"robot {self._options.robot!r} published no new pose within {timeout_s:g} s",
                     remedy="check that its program runs, and its name, station and router: "
@@ -117,14 +128,8 @@ class PoseZenoh(BusDevice):
                 ) from error
             reading = self._reading(received)
             if reading is not None:
-                readings.append(reading)
-        if not readings:
-            raise DeviceLost(
-                f"the program of robot {self._options.robot!r} has restarted",
-                remedy="nothing, if that is right; if not, two programs use this name",
-            )
-        self._counts["samples"] += len(readings)
-        return readings
+                count += 1
+                yield reading
 
     def _reading(self, received: ReceivedMessage[RobotPoseFrame]) -> PoseReading | None:
         """The tip; None, and counted, if the pose is rejected."""

@@ -53,14 +53,12 @@ class NetftSettings:
     """What palpate needs of the device's settings.
 
     Attributes:
-        product: Name of the product; empty if the device gives none.
         serial: Serial number of the calibration in use; empty where the device gives none.
         scale: What a count is worth in N and N m.
         sample_rate_hz: Rate at which the device samples [Hz]; None where it does not say.
         rdt_rate_hz: Rate at which it sends records [Hz]; None where it does not say.
     """
 
-    product: str
     serial: str
     scale: RdtScale
     sample_rate_hz: float | None
@@ -80,7 +78,6 @@ def parse_netft_xml(document: bytes) -> NetftSettings:
             f"netftapi2.xml: nothing in the tags {', '.join(missing)}", remedy=_BROWSER_REMEDY
         )
     return NetftSettings(
-        product=tags.get("prodname", ""),
         serial=tags.get("cfgcalsn", ""),
         scale=RdtScale(
             counts_per_n=_per_si_unit(tags, "cfgcpf", "scfgfu", FORCE_UNITS_N),

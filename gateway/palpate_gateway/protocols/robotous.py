@@ -25,24 +25,18 @@ _COUNTS = struct.Struct(">6h")
 
 
 class RobotousCommand(IntEnum):
-    """First data byte of requests and replies."""
+    """First data byte of requests and replies; those that the driver needs."""
 
     MODEL = 1
     SERIAL = 2
     FIRMWARE = 3
-    SET_CAN_IDS = 4
-    GET_CAN_IDS = 5
     SET_BAUD = 6
-    GET_BAUD = 7
     SET_FILTER = 8
-    GET_FILTER = 9
     SAMPLE = 10
     START = 11
     STOP = 12
     SET_RATE = 15
-    GET_RATE = 16
     BIAS = 17
-    OVERLOADS = 18
 
 
 class RobotousFilterOrder(Enum):
@@ -72,19 +66,7 @@ ERRORS = {1: "unsupported", 2: "out of range", 3: "failed"}
 
 _COMMANDS = {int(command): command for command in RobotousCommand}
 _TEXTS = (RobotousCommand.MODEL, RobotousCommand.SERIAL, RobotousCommand.FIRMWARE)
-_SETTINGS = (
-    RobotousCommand.SET_CAN_IDS,
-    RobotousCommand.SET_BAUD,
-    RobotousCommand.SET_FILTER,
-    RobotousCommand.SET_RATE,
-)
-_VALUES = {
-    RobotousCommand.GET_CAN_IDS: 6,
-    RobotousCommand.GET_BAUD: 2,
-    RobotousCommand.GET_FILTER: 2,
-    RobotousCommand.GET_RATE: 1,
-    RobotousCommand.OVERLOADS: 6,
-}
+_SETTINGS = (RobotousCommand.SET_BAUD, RobotousCommand.SET_FILTER, RobotousCommand.SET_RATE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,27 +108,13 @@ class RobotousResult:
 
 
 @dataclass(frozen=True, slots=True)
-class RobotousValues:
-    """Answer to a get request.
-
-    Attributes:
-        command: The request that is answered.
-        values: CAN ids: request, first, second now, then the same three after restart. Baud: code
-            now, code after restart. Filter: type, code. Rate: code. Overloads: count of each axis.
-    """
-
-    command: RobotousCommand
-    values: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class RobotousUnknown:
     """An answer of another kind, as it came."""
 
     payload: bytes
 
 
-RobotousRecord = RobotousData | RobotousText | RobotousResult | RobotousValues | RobotousUnknown
+RobotousRecord = RobotousData | RobotousText | RobotousResult | RobotousUnknown
 
 
 def decode(payload: bytes) -> RobotousRecord:
@@ -162,8 +130,6 @@ def decode(payload: bytes) -> RobotousRecord:
     if command in _SETTINGS:
         ok = payload[1] == 1
         return RobotousResult(command, ok, 0 if ok else payload[2])
-    if command in _VALUES:
-        return RobotousValues(command, tuple(payload[1 : 1 + _VALUES[command]]))
     return RobotousUnknown(payload)  # stop and bias have no answer
 
 

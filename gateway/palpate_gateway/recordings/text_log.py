@@ -16,7 +16,7 @@ from pydantic import Field
 from palpate.config import StrictConfig
 from palpate.errors import ConfigError, RecordingError
 from palpate.messages import SensorType
-from palpate_gateway.biotac.frames import FrameAssembler
+from palpate_gateway.biotac.frames import BELIEVABLE_LOSS, FrameAssembler
 from palpate_gateway.biotac.slots import UNKNOWN, SlotBlock
 from palpate_gateway.device import DeviceIdentity, FileDevice, SerialOption
 from palpate_gateway.protocols import channels as ch
@@ -169,7 +169,9 @@ class TextLogReader:
         """Times on the grid of slots, with gaps for frames that are missing by their counter."""
         # A log without times still counts its frames: each missing one leaves a gap of a round.
         before = frame[0] if self._frame_before is None else self._frame_before
-        missing = np.maximum(np.diff(frame, prepend=before) - 1, 0)
+        missing = np.diff(frame, prepend=before) - 1
+        # As the assembler counts: one damaged number must not move the rest by days.
+        missing = np.where((missing > 0) & (missing <= BELIEVABLE_LOSS), missing, 0)
         index = self._slots_before + np.arange(len(frame))
         index = index + self.sensor_type.layout.slots * np.cumsum(missing)
         self._slots_before = int(index[-1]) + 1

@@ -129,14 +129,12 @@ class LogHeader:
             [ns since the Unix epoch]; None where it has none.
         serials: Serial number by port, cut at the first non-printable byte.
         sample_rate_hz: Slots per second [Hz].
-        frames_in_batch: Frames in a batch (the public log says 7 and has 4).
     """
 
     lines: int = 0
     started_wall_ns: int | None = None
     serials: tuple[str, ...] = ()
     sample_rate_hz: float = SLOT_RATE_HZ
-    frames_in_batch: int = 0
 
     def serial(self, port: int) -> str:
         """Serial number at a port counted from 1; empty where the header has none."""
@@ -204,7 +202,6 @@ def _parse(name: str, lines: list[bytes]) -> LogHeader:
         started_wall_ns=_started(values),
         serials=_by_port(values.get("serial number", b"")),
         sample_rate_hz=rate,
-        frames_in_batch=int(_number(name, values, "framesinbatch", 0.0)),
     )
 
 

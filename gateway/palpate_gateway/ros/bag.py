@@ -242,7 +242,8 @@ class RosBag(FileDevice):
     @property
     def counters(self) -> Mapping[str, int]:
         """Readings, messages that are none, and what could not be decoded."""
-        return {**self._track.counters, **self._counts}
+        jumps = self._track.counters["time_jumps"] + self._counts["time_jumps"]
+        return {**self._track.counters, **self._counts, "time_jumps": jumps}
 
     def _open(self) -> DeviceIdentity:
         options = self._options
@@ -263,7 +264,13 @@ class RosBag(FileDevice):
         if not first.whole_frames:
             period_s = 1.0 / (options.rate_hz * kind.layout.slots)
         serial = options.serial or finger.serial or f"{options.path.stem}-{options.finger}"
-        return DeviceIdentity(serial, period_s, start_wall_ns=origin_ns, sensor_type=kind)
+        return DeviceIdentity(
+            serial,
+            period_s,
+            start_wall_ns=origin_ns,
+            sensor_type=kind,
+            rate_hz=options.rate_hz,
+        )
 
     def _first(self, bag: RosBagFile, topic: str) -> tuple[RosHand, RosFinger]:
         """The first message with the finger."""

@@ -134,7 +134,9 @@ class RosBiotac(RosDevice):
         serial = self._options.serial or finger.serial or f"{name}-{self._options.finger}"
         self._serial = finger.serial
         self._kind = kind
-        return DeviceIdentity(serial, period_s, sensor_type=kind)
+        # Its driver may publish fewer frames than slots would make.
+        rate_hz = self._options.rate_hz
+        return DeviceIdentity(serial, period_s, sensor_type=kind, rate_hz=rate_hz)
 
     def _close(self) -> None:
         self._topic.close()
@@ -145,10 +147,9 @@ class RosBiotac(RosDevice):
             early, self._early = self._early, None
             left_s = max(until - time.monotonic(), 0.0)
             messages = self._topic.take(left_s) if early is None else [early]
-            readings: list[Reading] = []
-            readings += [one for message in messages if (one := self._reading(message))]
+            readings = self._before_error(self._reading(message) for message in messages)
             if readings:
-                return readings
+                return list(readings)
             if time.monotonic() >= until:
                 raise DeviceTimeout(
                     f"{self.info.model}: no new reading within {timeout_s:g} s",

@@ -18,6 +18,9 @@ Channel = Literal["pac", "pdc", "tac", "tdc"]
 _BEGAN_ANEW = 10
 """So many messages in a row with an earlier time show that the clock of ROS was set back."""
 
+_JUMP_S = 3600.0
+"""A longer step between two messages is of a clock that was set, e.g. from 1970 to now [s]."""
+
 
 class FingerTrack:
     """The readings of one finger of a hand.
@@ -28,7 +31,8 @@ class FingerTrack:
     ``counters``: ``samples`` (readings), ``repeated_readings`` (a message without a new count of
     electrodes, PDC, TAC or TDC), ``repeated_messages`` (no later time), ``late_messages`` (an
     earlier one), ``absent`` (the finger is not in the message, or all its values are 0),
-    ``bad_counts`` (values below 0 or above 4095), ``missing_readings``.
+    ``bad_counts`` (values below 0 or above 4095), ``missing_readings``, ``time_jumps``
+    (the clock was set forward; nothing counts as missing).
 
     Args:
         place: Place of the finger in the message, from 1.
@@ -62,7 +66,7 @@ class FingerTrack:
         self.counters.update(
             dict.fromkeys(
                 ("samples", "repeated_readings", "repeated_messages", "late_messages", "absent",
-                 "bad_counts", "missing_readings"), 0,
+                 "bad_counts", "missing_readings", "time_jumps"), 0,
             )
         )  # fmt: skip
         self.restarted = False
@@ -133,7 +137,11 @@ class FingerTrack:
         """Readings lost before this message: by time, and no more than messages are lost."""
         if self._heard_s is None:
             return 0
-        by_time = max(round((time_s - self._heard_s) * self._rate_hz) - 1, 0)
+        step_s = time_s - self._heard_s
+        if step_s > _JUMP_S:
+            self.counters["time_jumps"] += 1
+            return 0
+        by_time = max(round(step_s * self._rate_hz) - 1, 0)
         return by_time if lost is None else min(by_time, lost)
 
     def _reading(

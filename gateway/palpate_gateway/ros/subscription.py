@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -103,6 +102,7 @@ class RosSubscription(Generic[T]):
         self._gid: bytes | None = None
         self._sequence = 0
         self._heard_s = 0.0
+        self._end: DeviceLost | None = None
 
     def join(self, link: LinkConfig) -> None:
         """The gateway's own way to the bus; the options take precedence."""
@@ -184,9 +184,13 @@ class RosSubscription(Generic[T]):
         """The next message, and those that have come already; the errors are those of ``next``."""
         messages = [self.next(timeout_s)]
         assert self._subscriber is not None
-        with contextlib.suppress(DeviceTimeout):  # what waited was nothing to deliver
+        try:
             for _ in range(min(self._subscriber.waiting, _BATCH)):
                 messages.append(self.next(0.0))
+        except DeviceTimeout:
+            pass  # what waited was nothing to deliver
+        except DeviceLost as error:
+            self._end = error  # raised when these are taken
         return messages
 
     def next(self, timeout_s: float) -> RosMessage[T]:
@@ -197,6 +201,8 @@ class RosSubscription(Generic[T]):
             DeviceLost: The publisher was started again, or another has taken its place.
         """
         assert self._subscriber is not None
+        if self._end is not None:
+            raise self._end
         until = time.monotonic() + timeout_s
         while True:
             try:

@@ -66,7 +66,7 @@ class RosWrench(WrenchDevice, RosDevice):
     """A force/torque sensor behind a topic.
 
     ROS has no common way to take its zero in the device, so this driver subtracts it: the zero is
-    lost with the gateway, and with the publisher, and the sensor's range is not used better.
+    lost with the publisher, and the sensor's range is not used better.
     """
 
     options_class = RosWrenchOptions
@@ -106,6 +106,14 @@ class RosWrench(WrenchDevice, RosDevice):
             )
         self._offset, self._zeroed = mean, self._topic.publisher
 
+    def _zero_note(self) -> bytes:
+        return self._offset.tobytes() + (self._zeroed or b"")
+
+    def _resume_zero(self, note: bytes) -> None:
+        offset, publisher = note[: self._offset.nbytes], note[self._offset.nbytes :]
+        if publisher:
+            self._offset, self._zeroed = np.frombuffer(offset), publisher
+
     def _keeps_zero(self) -> bool:
         return self._same_publisher
 
@@ -128,7 +136,7 @@ class RosWrench(WrenchDevice, RosDevice):
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
         early, self._early = self._early, None
         messages = self._topic.take(timeout_s) if early is None else [early]
-        return [reading for one in messages if (reading := self._take(one)) is not None]
+        return self._before_error(self._take(one) for one in messages)
 
     def _take(self, message: RosMessage[RosWrenchMessage]) -> WrenchReading | None:
         time_ns = message.message.time_ns or message.sent_ns or message.arrival_ns

@@ -25,7 +25,7 @@ from palpate_gateway.condition.stillness import StillLimits
 from palpate_gateway.config import GatewayConfig, SensorConfig
 from palpate_gateway.device import BusDevice, Device
 from palpate_gateway.drivers import make_device
-from palpate_gateway.kept_tare import KeptTare
+from palpate_gateway.kept_tare import KeptTare, KeptZero
 from palpate_gateway.service.pipeline import Pipeline
 from palpate_gateway.service.requests import with_caller
 from palpate_gateway.service.sensor_key import ClaimedKey
@@ -154,6 +154,9 @@ def _device(sensor: SensorConfig) -> Device:
             f"sensor {sensor.name!r} is of {sensor.of!r}, and a tactile sensor itself",
             remedy="`of` is for force/torque sensors and poses of the indenter: leave it out",
         )
+    kept = KeptZero.of(sensor.name)
+    if isinstance(device, WrenchDevice) and kept is not None:
+        device.keep_zero(kept.keep, kept.find())
     return device
 
 

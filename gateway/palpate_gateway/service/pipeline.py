@@ -103,7 +103,7 @@ class Pipeline:
 
     @property
     def tare_error(self) -> DeviceError | None:
-        """Why the last attempt to tare failed; None after a success."""
+        """Why the sensor is not tared, or not again without a request; None after a success."""
         return self._tares.error
 
     def begin(self, identity: DeviceIdentity, clock: ClockMap) -> None:
@@ -183,7 +183,7 @@ class Pipeline:
                 self._counts["missing_frames"] += item.message.stamp.missed_before
                 self._published.append((item.message, item.due_ns))
             elif isinstance(reading, RecordedMessage):
-                self._count_recorded(reading, arrival_ns)
+                self._count_recorded(reading)
                 put(item)
             else:
                 self._pass(item, put)
@@ -263,7 +263,7 @@ class Pipeline:
                 item = replace(item, message=replace(item.message, tare_id=tare_id))
             self._pass(item, put)
 
-    def _count_recorded(self, reading: RecordedMessage, arrival_ns: int) -> None:
+    def _count_recorded(self, reading: RecordedMessage) -> None:
         """A recorded message goes out as it is; its tare is kept for later requests.
 
         One that does not decode goes out as well: it was recorded so, and each consumer rejects it.
@@ -273,8 +273,10 @@ class Pipeline:
                 self._counts["frames_published"] += 1
                 frame = ELECTRODE_FRAME.decode(reading.payload)
                 self._counts["missing_frames"] += frame.stamp.missed_before
-                # Frames that its recorder never got; they are missing as well.
-                hole = self._holes.take("", frame.stamp, arrived_ns=arrival_ns)
+                # Frames that its recorder never got are missing as well. By its times of arrival:
+                # a fast replay reads them all at once.
+                arrived_ns = round(reading.time_s * 1e9)
+                hole = self._holes.take("", frame.stamp, arrived_ns=arrived_ns)
                 self._counts["missing_frames"] += hole
                 self._counts["frames_untared"] += frame.tare_id == NO_TARE
             elif reading.topic == TARE.name:

@@ -20,6 +20,7 @@ _LOOK_S = 0.2
 _LOG_AGAIN_S = 60.0
 """A sensor that stays away is logged again after this time only [s]: attempts follow closely."""
 
+_ZERO_LOST = "the zero that it had may be gone: it was opened again, or refused a new one"
 _ZERO_REMEDY = "when nothing touches the BioTac, take its zero again: palpate tare {name}"
 
 
@@ -55,7 +56,7 @@ class SensorReport:
         self.is_wrong = zero_lost or (condition is not None and condition.has_wrong_channel)
         if zero_lost:
             state = SensorState.ZERO_LOST
-            message = "it was opened again: the zero that it had may be gone"
+            message = _ZERO_LOST
         elif condition is not None and condition.warm_up.warming:
             state = SensorState.WARMING
         else:
@@ -112,10 +113,11 @@ class SensorReport:
             if self._refused is not None:
                 self._health.over(self._refused)
             self._refused = None
-        elif self._refused is None:
-            self._refused = error
+        elif self._refused is None or error.problem != self._refused.problem:
             self._health.fail(error, degraded=False)
-            _log.warning("sensor %s: %s", self._name, error, extra=about(self._name))
+            if self._refused is None:  # attempts follow closely
+                _log.warning("sensor %s: %s", self._name, error, extra=about(self._name))
+            self._refused = error
 
     def _set_state(
         self, state: SensorState, faults: tuple[ChannelFault, ...] = (), message: str = ""
@@ -139,7 +141,7 @@ class SensorReport:
     def _report_zero(self, *, zero_lost: bool) -> None:
         if zero_lost and not self._zero_lost:
             error = DeviceError(
-                f"sensor {self._name!r} was opened again: the zero that it had may be gone",
+                f"sensor {self._name!r}: {_ZERO_LOST}",
                 remedy=_ZERO_REMEDY.format(name=self._name),
             )
             self._health.fail(error)

@@ -182,6 +182,8 @@ class SensorWorker:
         )
         self._counters: Counter[str] = Counter()
         self._device_counters: Counter[str] = Counter()
+        self._added = False
+        """Whether these hold those of the device, which keeps them until it is opened again."""
         self._report = SensorReport(name, health)
         self._wrench = device if isinstance(device, WrenchDevice) else None
         self.zeroing = None if self._wrench is None else Zeroing(name, self._wrench)
@@ -201,15 +203,18 @@ class SensorWorker:
 
     def join(self, timeout_s: float) -> None:
         """Wait for the thread's end; ``stop`` must be set or the source finite."""
-        self._thread.join(timeout_s)
+        if self._thread.ident is not None:  # else it was never started
+            self._thread.join(timeout_s)
 
     def counters(self) -> dict[str, int]:
         """Everything counted for this sensor since the start."""
-        device = self._device_counters + Counter(self.device.counters)
+        # Copies: other threads count new events while the counters are added.
+        present = dict(self.device.counters)
+        device = Counter(self._device_counters) + Counter({} if self._added else present)
         device.pop("frames", None)  # the pipeline counts what was published
         # The pipeline counts the missing frames of every device; adding Counters drops zeros.
-        zeros = dict.fromkeys(self.device.counters.keys() - {"frames"}, 0)
-        own = self._counters + self._publisher.counters
+        zeros = dict.fromkeys(present.keys() - {"frames"}, 0)
+        own = Counter(self._counters) + Counter(self._publisher.counters)
         if self._clock_map is not None:
             own += Counter(self._clock_map.counters)
         return {**zeros, **device, **own, **self.pipeline.counters}
@@ -274,6 +279,7 @@ class SensorWorker:
             self._turns.next(LATE_S)
             try:
                 self.device.open()
+                self._added = False
                 self._key.opened(self.device.identity.serial)
                 if self._clock_map is not None:
                     self._counters += Counter(self._clock_map.counters)
@@ -295,11 +301,13 @@ class SensorWorker:
                     raise
                 if self.serving:
                     backoff_s = BACKOFF_S[0]
+                    self._counters["device_lost"] += 1
                 self.serving = self.silent = False
-                self._counters["device_lost"] += 1
                 self._report.is_lost(error, backoff_s)
                 self._give_up(error.problem)
-            self._device_counters += Counter(self.device.counters)
+            if not self._added:
+                self._device_counters += Counter(self.device.counters)
+                self._added = True
             self._turns.next(LATE_S)
             self.device.close()
             self._turns.next(inf)  # another gateway may hold the key for as long as it likes

@@ -33,7 +33,9 @@ _SILENCE_S = 0.3
 
 _BITS_PER_BYTE = 10
 _WRAP_US = 1 << 32
-_RAW = 1 << wire.STATUS_NAMES.index("raw")
+_NO_WRENCH = wire.INVALID | 1 << wire.STATUS_NAMES.index("raw")
+"""Bits of the status of a frame without a wrench."""
+
 _ZERO_S = 0.2
 _NO_OFFSETS = (0.0,) * 6
 
@@ -115,6 +117,13 @@ class WrenchBota(WrenchDevice):
         The sensor adds offsets to its measurement. It cannot be asked for its present offsets, so
         they are cleared first. The samples afterwards show whether the sign was right.
         """
+        try:
+            self._zero_anew()
+        except DeviceError:
+            self._lose_zero()
+            raise
+
+    def _zero_anew(self) -> None:
         self._set_offsets(_NO_OFFSETS)
         before, noise = self._mean()
         self._set_offsets(tuple(-float(value) for value in before))
@@ -190,7 +199,7 @@ class WrenchBota(WrenchDevice):
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
         frames = self._unless_silent(self._frames, timeout_s, _SILENCE_S)
-        return [reading for frame in frames if (reading := self._take(frame)) is not None]
+        return self._before_error(self._take(frame) for frame in frames)
 
     def _frames(self, timeout_s: float) -> list[BotaFrame]:
         data, self._early = self._early, b""
@@ -209,7 +218,7 @@ class WrenchBota(WrenchDevice):
         if status := frame.status & ~wire.OVERRANGE:
             for name in wire.status_names(status):
                 self._counts["status_" + name.replace(" ", "_")] += 1
-        if frame.status & (wire.INVALID | _RAW):
+        if frame.status & _NO_WRENCH:
             self._counts["invalid_samples"] += 1
             return None
         return self._reading(
@@ -234,7 +243,8 @@ class WrenchBota(WrenchDevice):
         while len(frames) < count:
             frames += self._frames(max(until - time.monotonic(), 0.0))
         values = np.array([frame.wrench for frame in frames], np.float64)
-        if any(frame.status for frame in frames) or not np.isfinite(values).all():
+        unfit = any(frame.status & (_NO_WRENCH | wire.OVERRANGE) for frame in frames)
+        if unfit or not np.isfinite(values).all():
             raise DeviceError(
                 f"{self.info.model}: its samples are not valid now",
                 remedy="see its status counters",

@@ -114,7 +114,7 @@ class WrenchOptions(StrictConfig):
         serial: Serial number to publish; empty = the device's own, or its address.
         zero_at_start: Take the load at the first opening as zero; choose it only if nothing
             touches the BioTac then. A sensor that was lost and comes back is not zeroed, because it
-            may be loaded.
+            may be loaded; nor is one whose gateway was killed and started again.
         zero_max_sd_n: Standard deviation of a force above which no zero is taken on request [N].
         zero_max_sd_nm: The same of a torque [N m].
         gather_s: How long samples may wait for one another [s]: to wake for each of 1000 samples
@@ -143,9 +143,11 @@ class WrenchDevice(Device):
         self.zero_limits = options
         """Limits of the standard deviation for a zero on request."""
         self.zero_lost = False
-        """Whether its zero may be lost: it was opened again and does not report a zero."""
+        """Whether its zero may be lost: it was opened again and does not report a zero, or it
+        refused a new one and has given up the old one."""
         self._has_zero = False
         self._zero_at_start = options.zero_at_start
+        self._keep_note: Callable[[bytes], None] = lambda note: None
         self._gather_s = options.gather_s
         self._prompt_s = 0.0
         self._tick = 0
@@ -171,6 +173,32 @@ class WrenchDevice(Device):
         self.zero()
         self._has_zero, self.zero_lost = True, False
         self._counts["zeros"] += 1
+        self._keep_note(self._zero_note())
+
+    def _lose_zero(self) -> None:
+        """The zero that it has taken, if any, may be gone."""
+        if self._has_zero:
+            self._has_zero, self.zero_lost = False, True
+            self._counts["zero_lost"] += 1
+
+    def keep_zero(self, keep: Callable[[bytes], None], note: bytes | None) -> None:
+        """Note each zero for a gateway that is started again; call it before the first opening.
+
+        Args:
+            keep: Keeps the note of a zero.
+            note: That of the gateway before, whose zero counts as taken; None = it took none.
+        """
+        self._keep_note = keep
+        if note is not None:
+            self._has_zero, self._zero_at_start = True, False
+            self._resume_zero(note)
+
+    def _zero_note(self) -> bytes:
+        """What ``_resume_zero`` needs of a zero that is not in the device."""
+        return b""
+
+    def _resume_zero(self, note: bytes) -> None:
+        """Go on with a zero that another process has taken; what its ``_zero_note`` was."""
 
     def _keeps_zero(self) -> bool:
         """Whether the device reports, when it is connected again, that it still has its zero."""
@@ -196,10 +224,9 @@ class WrenchDevice(Device):
             if self._zero_at_start:
                 self.take_zero()
                 self._zero_at_start = False
-            elif self._has_zero and not self._keeps_zero():
+            elif not self._keeps_zero():
                 # No known product stores its zero: a sensor that was without power has lost it.
-                self._has_zero, self.zero_lost = False, True
-                self._counts["zero_lost"] += 1
+                self._lose_zero()
         except BaseException:
             self._close()
             raise

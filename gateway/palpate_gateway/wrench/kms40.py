@@ -144,7 +144,8 @@ class WrenchKms40(WrenchDevice):
                     raise
 
     def _check_flags(self) -> None:
-        self._ask(wire.query_request(wire.KmsQuery.FLAGS), "FLAGS")
+        hint = "; where its firmware has no FLAGS, set flags_every_s = 0"
+        self._ask(wire.query_request(wire.KmsQuery.FLAGS), "FLAGS", hint=hint)
         faults = self._flags & wire.FAULTS
         if faults:
             raise DeviceError(
@@ -229,9 +230,17 @@ class WrenchKms40(WrenchDevice):
             self._counts["status_calibration_not_valid"] += 1
 
     def _ask(
-        self, request: bytes, name: str, wanted: str | None = None, *, within_s: float = _ANSWER_S
+        self,
+        request: bytes,
+        name: str,
+        wanted: str | None = None,
+        *,
+        within_s: float = _ANSWER_S,
+        hint: str = "",
     ) -> str:
         """The value in the answer to a request; samples before the answer are discarded.
+
+        ``hint`` ends the remedy where there is none.
 
         Raises:
             DeviceTimeout: No answer came.
@@ -249,7 +258,7 @@ class WrenchKms40(WrenchDevice):
                 if isinstance(record, KmsRefusal):
                     raise DeviceError(
                         f"{asked} was refused: {record.meaning} (error {record.code})",
-                        remedy="check that this is a KMS 40 whose firmware knows the command",
+                        remedy=f"check that it is a KMS 40 whose firmware knows the command{hint}",
                     )
                 if not isinstance(record, KmsReply):
                     continue
@@ -259,7 +268,7 @@ class WrenchKms40(WrenchDevice):
                     return self._checked(record.value, wanted, asked)
         raise DeviceTimeout(
             f"{asked} was not answered within {within_s:g} s",
-            remedy="check that this is a KMS 40 and that no other client is connected to it",
+            remedy=f"check that this is a KMS 40 and that no other client is connected to it{hint}",
         )
 
     def _checked(self, value: str, wanted: str | None, asked: str) -> str:

@@ -12,6 +12,7 @@ from tests.gateway.reading_devices import PATIENCE_S, open_again, read_frames
 
 from palpate.config import parse_config
 from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate.messages import ServiceState
 from palpate_gateway.biotac.bridge import BiotacBridge, BridgeOptions
 from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator, stuffed
 from palpate_gateway.emulators.biotac_slots import idle_counts
@@ -92,12 +93,66 @@ def test_three_fingers_of_one_line(
         assert times.min() > 0.0
 
 
+def test_what_others_of_the_line_counted_before_is_not_counted(
+    emulate: Emulate, finger: FingerQueue
+) -> None:
+    emulator = emulate(fingers=2)
+    first, second = finger(emulator.address), finger(emulator.address, port=2)
+    first.open()
+    for _ in range(2):
+        read_frames(first, lambda got: len(got) > 20)
+        before = first.counters["packets"]
+        second.open()
+        read_frames(second, lambda got: len(got) > 2)
+        since = second.counters["packets"]
+        assert 0 < since <= first.counters["packets"] - before
+        second.close()
+
+
+@pytest.mark.parametrize("fault", ["error_word", "parity"])
+def test_words_of_errors_are_no_parity_errors(
+    emulate: Emulate, finger: FingerQueue, fault: str
+) -> None:
+    emulator = emulate()
+    device = finger(emulator.address)
+    device.open()
+    emulator.inject(fault, 60.0)
+    read_frames(device, lambda got: len(got) > 10 and got[-1].validity != ALL_VALID)
+    found = {name for name, count in device.counters.items() if count}
+    told = {name for name in found if name == "parity_errors" or name.startswith("device_error")}
+    assert ("parity_errors" in told) == (fault == "parity")
+    assert len(told) == 1
+
+
+def test_an_opening_that_fails_brings_no_old_counts(emulate: Emulate, finger: FingerQueue) -> None:
+    emulator = emulate()
+    device = finger(emulator.address)
+    device.open()
+    read_frames(device, lambda got: len(got) > 2)
+    device.close()
+    assert device.counters["samples"] > 0
+    emulator.stop()
+    with pytest.raises(DeviceError):
+        device.open()
+    assert device.counters["samples"] == 0
+
+
 def test_a_slower_bridge_tells_its_rate(emulate: Emulate, finger: FingerQueue) -> None:
     device = finger(emulate(slot_rate_hz=2200.0, fingers=1).address)
     device.open()
     assert device.identity.slot_period_s == pytest.approx(1 / 2200)
     times = np.diff([one.time_s for one in read_frames(device, lambda got: len(got) > 10)])
     assert np.median(times) == pytest.approx(0.02, abs=1e-6)
+    assert device.info.rate_hz == pytest.approx(50.0)
+
+
+def test_a_slow_finger_is_not_silent_between_its_frames(bus: Any, emulate: Emulate) -> None:
+    options = {"line": emulate(slot_rate_hz=1000.0, fingers=1).address}
+    slow = {"name": "slow", "driver": "biotac_bridge", "options": options}
+    with bus.gateway({"sensors": [slow]}):
+        bus.state(ServiceState.READY)
+        now = bus.until(lambda: (s := bus.status()) and s.counters["frames_published"] > 50 and s)
+    assert now.counters.get("silences", 0) < 10
 
 
 def wait_for_packets(emulator: BiotacBridgeEmulator, count: int) -> None:

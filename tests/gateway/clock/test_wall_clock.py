@@ -104,13 +104,11 @@ def test_kernel_stamps_become_monotonic(stamps: KernelStamps, clocks: Clocks) ->
     assert stamps.monotonic_of_ns(stamp_ns, arrival_ns) == arrival_ns - 300_000
     # As a float it is known to a quarter of a microsecond.
     assert abs(stamps.monotonic_ns(stamp_ns * 1e-9, arrival_ns) - arrival_ns + 300_000) < 500
-    assert stamps.refused == 0
 
 
 def test_a_stamp_is_never_after_the_arrival(stamps: KernelStamps, clocks: Clocks) -> None:
     arrival_ns = clocks.now_ns
     assert stamps.monotonic_of_ns(EPOCH_NS + arrival_ns + 50_000, arrival_ns) == arrival_ns
-    assert stamps.refused == 0
 
 
 @pytest.mark.parametrize(
@@ -121,7 +119,6 @@ def test_a_stamp_that_cannot_be_is_refused(
     stamps: KernelStamps, clocks: Clocks, stamp_s: float
 ) -> None:
     assert stamps.monotonic_ns(stamp_s, clocks.now_ns) == clocks.now_ns
-    assert stamps.refused == 1
 
 
 def test_around_a_step_arrivals_stand_for_stamps(stamps: KernelStamps, clocks: Clocks) -> None:
@@ -136,7 +133,6 @@ def test_around_a_step_arrivals_stand_for_stamps(stamps: KernelStamps, clocks: C
     clocks.offset_ns += S
     old_ns = clocks.offset_ns - S + clocks.now_ns - 1_000_000
     assert stamps.monotonic_of_ns(old_ns, clocks.now_ns) == clocks.now_ns
-    assert stamps.refused == 2
     clocks.now_ns += OLDEST_NS + 1
     new_ns = clocks.offset_ns + clocks.now_ns - 40_000
     assert stamps.monotonic_of_ns(new_ns, clocks.now_ns) == clocks.now_ns - 40_000

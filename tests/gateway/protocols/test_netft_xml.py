@@ -28,16 +28,14 @@ def document(**tags: str | None) -> bytes:
 
 def test_settings_in_si_units() -> None:
     settings = parse_netft_xml(document())
-    assert (settings.product, settings.serial) == ("Net F/T", "FT01234")
+    assert settings.serial == "FT01234"
     assert (settings.scale.counts_per_n, settings.scale.counts_per_n_m) == (1e6, 1e6)
     assert (settings.sample_rate_hz, settings.rdt_rate_hz) == (7000.0, 1000.0)
 
 
 def test_only_the_scale_is_needed() -> None:
-    settings = parse_netft_xml(
-        document(prodname=None, cfgcalsn=None, runrate=None, comrdtrate="fast")
-    )
-    assert (settings.product, settings.serial) == ("", "")
+    settings = parse_netft_xml(document(cfgcalsn=None, runrate=None, comrdtrate="fast"))
+    assert settings.serial == ""
     assert (settings.sample_rate_hz, settings.rdt_rate_hz) == (None, None)
 
 
@@ -113,9 +111,9 @@ def test_what_is_not_xml(data: bytes) -> None:
 
 
 def test_other_encodings_and_namespaces() -> None:
-    text = document(prodname="Müller").decode()
-    assert parse_netft_xml(b"\xef\xbb\xbf" + text.encode()).product == "Müller"
-    assert parse_netft_xml(text.encode("latin-1")).product == "Müller"
+    text = document(cfgcalsn="Müller").decode()
+    assert parse_netft_xml(b"\xef\xbb\xbf" + text.encode()).serial == "Müller"
+    assert parse_netft_xml(text.encode("latin-1")).serial == "Müller"
     spaced = text.replace("<netft>", '<netft xmlns="urn:x"><settings>')
     assert parse_netft_xml(spaced.replace("</netft>", "</settings></netft>").encode()).serial
 
@@ -143,7 +141,7 @@ def test_document_type_does_not_hide_behind_a_named_encoding() -> None:
     with pytest.raises(DeviceError, match=r"not XML|document type"):
         parse_netft_xml(f"{head}?>".encode() + body.encode("cp037"))
     named = document().replace(b'"1.0"', b'"1.0" encoding="cp037"')
-    assert parse_netft_xml(named).product == "Net F/T"
+    assert parse_netft_xml(named).serial == "FT01234"
 
 
 def test_large_and_deep_documents() -> None:

@@ -82,7 +82,7 @@ def test_identity_is_text_up_to_its_end(command: int) -> None:
     assert full == rft.RobotousText(rft.RobotousCommand(command), "ABCDEFGHIJKLMNO")
 
 
-@pytest.mark.parametrize("command", [4, 6, 8, 15])
+@pytest.mark.parametrize("command", [6, 8, 15])
 def test_set_replies(command: int) -> None:
     assert rft.decode(reply(command, 1)) == rft.RobotousResult(
         rft.RobotousCommand(command), True, 0
@@ -93,14 +93,7 @@ def test_set_replies(command: int) -> None:
         assert rft.ERRORS[error] == name
 
 
-@pytest.mark.parametrize(("command", "values"), [(5, 6), (7, 2), (9, 2), (16, 1), (18, 6)])
-def test_get_replies(command: int, values: int) -> None:
-    record = rft.decode(bytes(range(command, command + 16)))
-    wanted = tuple(range(command + 1, command + 1 + values))
-    assert record == rft.RobotousValues(rft.RobotousCommand(command), wanted)
-
-
-@pytest.mark.parametrize("payload", [b"", DATA[:15], DATA + b"\0", reply(12), reply(17), reply(99)])
+@pytest.mark.parametrize("payload", [b"", DATA[:15], DATA + b"\0", reply(12), reply(18), reply(99)])
 def test_what_cannot_be_read_is_kept(payload: bytes) -> None:
     assert rft.decode(payload) == rft.RobotousUnknown(payload)
 
@@ -139,7 +132,6 @@ def test_filter_codes_follow_the_manuals_unless_told() -> None:
 
 def test_requests() -> None:
     assert rft.request(rft.RobotousCommand.MODEL) == reply(1)[:8]
-    assert rft.request(rft.RobotousCommand.OVERLOADS) == reply(18)[:8]
     assert rft.baud_request(921600) == reply(6, 1)[:8]
     rates = {rate: rft.rate_request(rate)[1] for rate in (10, 20, 50, 100, 200, 333, 500, 1000)}
     assert rates == {10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8}

@@ -190,6 +190,19 @@ class TestTrack:
         track.take(hand_of(9))
         assert track.restarted
 
+    @pytest.mark.parametrize("lost", [None, 0])
+    def test_a_clock_that_is_set_forward_makes_nothing_missing(self, lost: int | None) -> None:
+        track = FingerTrack(1, rate_hz=100.0)
+        set_forward = 100 * 86_400 * 365 * 8  # frames of eight years
+        for k in (0, 1, set_forward, set_forward + 1):
+            reading = track.take(hand_of(k), lost=lost)
+            assert reading is not None
+            assert reading.missed_before == 0
+        assert (track.counters["time_jumps"], track.counters["missing_readings"]) == (1, 0)
+        again = track.take(hand_of(set_forward + 4))
+        assert again is not None
+        assert again.missed_before == 2, "it is followed as before"
+
     @pytest.mark.parametrize(("lost", "missed"), [(None, 3), (3, 3), (1, 1), (0, 0), (9, 3)])
     def test_missing_readings_are_counted_by_time_and_number(
         self, lost: int | None, missed: int

@@ -95,6 +95,15 @@ def test_two_fingers_of_a_hand_are_two_devices() -> None:
         assert not absent.is_open
 
 
+def test_the_rate_is_that_of_the_readings_not_of_the_slots() -> None:
+    with (
+        RosHandEmulator(whole_frames=True, rate_hz=20.0) as emulator,
+        finger_at(emulator, HAND, rate_hz=20.0) as device,
+    ):
+        assert device.identity.slot_period_s == pytest.approx(1 / 4400, rel=1e-3)
+        assert device.info.rate_hz == 20.0
+
+
 def test_lost_messages_are_missing_readings() -> None:
     with RosHandEmulator() as emulator, finger_at(emulator, repeats="keep") as device:
         take(device, 5)

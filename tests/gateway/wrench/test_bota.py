@@ -164,6 +164,31 @@ def test_offsets_that_work_otherwise_are_found(monkeypatch: pytest.MonkeyPatch) 
         assert Follower(device, WrenchReading).more(1)[0].force == pytest.approx(LOAD[:3])
 
 
+def test_a_zero_that_fails_has_cost_the_one_before() -> None:
+    with BotaEmulator(lambda _: LOAD) as sensor, make(sensor) as device:
+        sensor.inject("overload", 60.0)
+        with pytest.raises(DeviceError, match="not valid now"):
+            device.take_zero()
+        assert not device.zero_lost, "it had none"
+        sensor.inject("overload", 1e-9)
+        device.take_zero()
+        sensor.inject("overload", 60.0)
+        with pytest.raises(DeviceError, match="not valid now"):
+            device.take_zero()
+        assert (device.zero_lost, device.counters["zero_lost"]) == (True, 1)
+        sensor.inject("overload", 1e-9)
+        device.take_zero()
+        assert not device.zero_lost
+        assert Follower(device, WrenchReading).more(1)[0].force == pytest.approx(0.0, abs=1e-3)
+
+
+def test_late_samples_are_good_for_a_zero() -> None:
+    with BotaEmulator(lambda _: LOAD) as sensor, make(sensor) as device:
+        sensor.inject("late", 60.0)
+        device.take_zero()
+        assert Follower(device, WrenchReading).more(1)[0].force == pytest.approx(0.0, abs=1e-3)
+
+
 AWAY = [
     ("silence", 0.1, "lost_samples"),
     ("silence", 0.45, "error: no sample came for 0.3 s"),

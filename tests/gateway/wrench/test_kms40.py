@@ -173,6 +173,8 @@ class Contrary(Kms40Emulator):
         ("SN()", 'SN=""', "gives no serial number"),
         ("LDIV(1)", "LDIV=2", r"LDIV\(1\) was answered with '2' instead of '1'"),
         ("L1()", "", r"L1\(\) was not answered within 2 s"),
+        ("FLAGS()", "ERROR(14)", r"FLAGS\(\) was refused.*has no FLAGS, set flags_every_s = 0"),
+        ("FLAGS()", "", r"FLAGS\(\) was not answered.*has no FLAGS, set flags_every_s = 0"),
     ],
 )
 def test_a_wrong_answer_says_which(request_line: str, reply: str, message: str) -> None:

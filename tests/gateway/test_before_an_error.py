@@ -1,0 +1,146 @@
+"""What came before an error is delivered first, also where both came at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from tests.gateway.pose_fakes import BENCH, frame
+from tests.gateway.ros_fakes import BEGAN_NS, all_fields, wrench_fields
+
+from palpate.config import parse_config
+from palpate.errors import DeviceLost, StreamTimeout
+from palpate.messages import Pose
+from palpate.ros.layouts import BIOTAC_ALL, WRENCH_STAMPED, encode
+from palpate.ros.rmw_zenoh import SampleInfo
+from palpate_gateway.device import Device, DeviceIdentity
+from palpate_gateway.drivers import make_device
+from palpate_gateway.pose.robot import PoseZenoh
+from palpate_gateway.protocols.bota import BotaFrame
+from palpate_gateway.protocols.ros_hands import decode_hand
+from palpate_gateway.readings import Reading
+from palpate_gateway.ros import subscription
+from palpate_gateway.ros.subscription import RosDevice, RosMessage, RosSubscription, RosTopicOptions
+from palpate_gateway.ros.wrench import decode_wrench
+from palpate_gateway.wrench.bota import BotaOptions, WrenchBota
+
+GOOD = 3
+"""Good readings of each batch; behind them the clock goes back for good."""
+
+SET_BACK = [*range(GOOD), *range(-100, -80)]
+
+TOPIC = {"topic": "/a", "connect": "tcp/127.0.0.1:1"}
+
+
+class Waiting:
+    """A topic with everything waiting already."""
+
+    counters: dict[str, int] = {}  # noqa: RUF012
+    publisher = None
+
+    def __init__(self, messages: Sequence[Any]) -> None:
+        self._messages = [RosMessage(one, None, 0, 1 + k) for k, one in enumerate(messages)]
+
+    def open(self) -> Any:
+        return self._messages.pop(0)
+
+    def take(self, timeout_s: float) -> Any:
+        return self._messages
+
+    def close(self) -> None:
+        pass
+
+
+def of_a_topic(driver: str, messages: Sequence[Any], **options: Any) -> Device:
+    device = make_device(driver, {**TOPIC, **options})
+    assert isinstance(device, RosDevice)
+    device._topic = Waiting(messages)  # type: ignore[assignment]
+    return device
+
+
+def ros_biotac() -> Device:
+    layout = BIOTAC_ALL
+    hands = [
+        decode_hand(encode(all_fields(k % 40, BEGAN_NS + 10**7 * k), layout), layout)
+        for k in SET_BACK
+    ]
+    return of_a_topic("ros_biotac", hands, message="sr_robot_msgs/BiotacAll")
+
+
+def ros_wrench() -> Device:
+    wrenches = [
+        decode_wrench(encode(wrench_fields(k, BEGAN_NS + 10**7 * k), WRENCH_STAMPED))
+        for k in SET_BACK
+    ]
+    return of_a_topic("ros_wrench", wrenches)
+
+
+def bota() -> Device:
+    class OfOneBatch(WrenchBota):
+        def _connect(self) -> str:
+            return "a"
+
+        def _frames(self, timeout_s: float) -> list[BotaFrame]:
+            return [
+                BotaFrame(0, (1.0,) * 6, stamp_us, 20.0)
+                for stamp_us in (90_000_000, 90_002_500, 90_005_000, 1_000, 3_500)
+            ]
+
+    return OfOneBatch(BotaOptions(port="a", rate_hz=400.0))
+
+
+def pose_zenoh() -> Device:
+    away = frame(GOOD, pose=Pose((600.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+    frames = [*(frame(k) for k in range(GOOD)), away]
+
+    class OneBatch:
+        counters: dict[str, int] = {}  # noqa: RUF012
+
+        def next(self, timeout_s: float) -> Any:
+            if not frames:
+                raise StreamTimeout("none", remedy="wait")
+            return SimpleNamespace(message=frames.pop(0), received_monotonic_ns=1)
+
+    device = make_device("pose_zenoh", {"robot": "arm", **BENCH})
+    assert isinstance(device, PoseZenoh)
+
+    def opened() -> DeviceIdentity:
+        device._subscriber = OneBatch()  # type: ignore[assignment]
+        return DeviceIdentity("arm", 1 / 250)
+
+    device._open = opened  # type: ignore[method-assign]
+    return device
+
+
+@pytest.mark.parametrize("make", [ros_biotac, ros_wrench, bota, pose_zenoh])
+def test_readings_before_an_error_are_delivered_and_counted(make: Any) -> None:
+    device = make()
+    with device:
+        readings: list[Reading] = []
+        with pytest.raises(DeviceLost):  # noqa: PT012
+            while len(readings) < 100:
+                readings += device.read(0.1)
+        assert len(readings) == GOOD == device.counters["samples"]
+
+
+def test_messages_before_another_publisher_are_delivered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subscription, "_OTHER_S", -1.0)
+    topic: RosSubscription[bytes] = RosSubscription(
+        parse_config(RosTopicOptions, TOPIC, where="test"), "", bytes
+    )
+    samples = [
+        SimpleNamespace(
+            payload=b"%d" % k,
+            attachment=SampleInfo(k, 1 + k, bytes([k // GOOD]) * 16).encode(),
+            received_monotonic_ns=1,
+        )
+        for k in range(GOOD + 1)
+    ]
+    topic._subscriber = SimpleNamespace(  # type: ignore[assignment]
+        next=lambda _: samples.pop(0), waiting=GOOD, counters={}
+    )
+    assert [one.message for one in topic.take(0.1)] == [b"0", b"1", b"2"]
+    with pytest.raises(DeviceLost, match="another publisher"):
+        topic.take(0.1)
