@@ -77,6 +77,7 @@ class ServiceManager:
         self._address = "\0" + name[1:] if name.startswith("@") else name
         self._ready = False
         self._due_ns = 0
+        self._within_s = LIMIT_S
         # The variables of the watchdog may be meant for the parent of this process.
         watched = found.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self._limit_us = int(found.get("WATCHDOG_USEC", "0")) if watched else 0
@@ -89,15 +90,17 @@ class ServiceManager:
     def alive(self, now_ns: int, *, within_s: float = LIMIT_S) -> None:
         """Say that this process serves, and is alive; sent at most a few times a second.
 
-        ``within_s`` is how long the next call may take [s].
+        ``within_s`` is how long the next call may take [s]; more than was said before is sent at
+        once.
         """
-        if self._socket is None or now_ns < self._due_ns:
+        if self._socket is None or (now_ns < self._due_ns and within_s <= self._within_s):
             return
         lines = [] if self._ready else ["READY=1"]
         if self._limit_us:
             lines += [f"WATCHDOG_USEC={max(self._limit_us, round(within_s * 1e6))}", "WATCHDOG=1"]
         if not lines or self.say(*lines):
             self._ready = True
+            self._within_s = within_s
             self._due_ns = now_ns + self._period_ns
 
     def say(self, *lines: str) -> bool:

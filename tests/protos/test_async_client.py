@@ -251,6 +251,28 @@ def test_calls_that_take_all_threads_are_cancelled() -> None:
     assert all(cancelled), "none ends by its own time"
 
 
+def test_a_client_whose_calls_take_all_threads_can_be_closed(link: LinkConfig) -> None:
+    goes_on = threading.Event()
+
+    async def scene() -> None:
+        async with AsyncClient(link.connect[0], station="test") as robot:
+            begun: list[None] = []
+
+            def call() -> None:
+                begun.append(None)
+                goes_on.wait(LIVE_S)
+
+            calls = [asyncio.create_task(robot.in_thread(call)) for _ in range(_AT_ONCE)]
+            while len(begun) < _AT_ONCE:
+                await asyncio.sleep(0.01)
+            await robot.aclose()
+            assert not any(one.done() for one in calls), "none had to end before"
+            goes_on.set()
+            await asyncio.gather(*calls)
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
 def test_a_simulation_reports_into_the_loop_and_is_stopped_with_its_task(
     link: LinkConfig, wait_until: WaitUntil
 ) -> None:

@@ -183,6 +183,6 @@ def check_limits(**arguments: float) -> None:
         nearest_m = round(value * 1e6) / 1e6
         if name == "edge_m" and abs(value - nearest_m) > 1e-12:
             raise ConfigError(
-                f"edge_m = {value} is not in whole micrometres",
+                f"edge_m = {value:g} is not in whole micrometres",
                 remedy=f"give {nearest_m:g}, or as an option {nearest_m * 1e3:g} mm",
             )

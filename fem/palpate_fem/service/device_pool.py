@@ -333,7 +333,7 @@ class DevicePool(Closing):
             for task in [task for task in self._waiting if task.deadline <= now]:
                 self._waiting.remove(task)
                 how = "the deadline passed while it waited"
-                ends.append((task, JobEnded(IndentationOutcome.DEADLINE, how)))
+                ends.append((task, self._ended(task, JobEnded(IndentationOutcome.DEADLINE, how))))
             there = [] if self._process is None else list(self._process.open.values())
             for task in there:
                 if task.overdue <= now and not task.over:

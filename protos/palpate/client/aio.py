@@ -199,7 +199,7 @@ class AsyncClient:
         self._client: Client | None = None
         self._streams: list[AsyncStream[Any]] = []
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="palpate call")
-        # Of its own: calls to be cancelled may have all of the others.
+        # Of its own, for cancelling and closing: calls that wait may have all of the others.
         self._canceller = ThreadPoolExecutor(1, thread_name_prefix="palpate cancel")
 
     features = _awaitable(Client.features)
@@ -270,7 +270,7 @@ class AsyncClient:
             await stream.aclose()
         client, self._client = self._client, None
         if client is not None:
-            await self.in_thread(client.close)
+            await asyncio.get_running_loop().run_in_executor(self._canceller, client.close)
         self._end_threads()
 
     def _end_threads(self) -> None:
