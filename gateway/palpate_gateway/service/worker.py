@@ -275,7 +275,7 @@ class SensorWorker:
     def _serve(self) -> None:
         backoff_s = BACKOFF_S[0]
         # Before the device is opened: some can serve one process only, and it may be another's.
-        while self._key.wait(self._stop, self._report.is_taken):
+        while self._key.wait(self._stop, self._is_taken):
             self._turns.next(LATE_S)
             try:
                 self.device.open()
@@ -293,7 +293,7 @@ class SensorWorker:
                     raise
                 self.serving = self.silent = False
                 self._counters["taken_over"] += 1
-                self._report.is_taken(error)
+                self._is_taken(error)
                 self._give_up(error.problem)
             except DeviceError as error:
                 if not self.device.info.live:
@@ -313,6 +313,12 @@ class SensorWorker:
             self._turns.next(inf)  # another gateway may hold the key for as long as it likes
             self._stop.wait(backoff_s)
             backoff_s = min(2.0 * backoff_s, BACKOFF_S[1])
+
+    def _is_taken(self, error: ClaimedElsewhere) -> None:
+        """Another gateway publishes under its key; it may have taken the zero, and a load since."""
+        self._report.is_taken(error)
+        if self._wrench is not None:
+            self._wrench.expect_load()
 
     def _clock(self) -> ClockMap:
         identity = self.device.identity

@@ -114,7 +114,8 @@ class WrenchOptions(StrictConfig):
         serial: Serial number to publish; empty = the device's own, or its address.
         zero_at_start: Take the load at the first opening as zero; choose it only if nothing
             touches the BioTac then. A sensor that was lost and comes back is not zeroed, because it
-            may be loaded; nor is one whose gateway was killed and started again.
+            may be loaded; nor is one whose gateway was killed and started again, or follows
+            another gateway.
         zero_max_sd_n: Standard deviation of a force above which no zero is taken on request [N].
         zero_max_sd_nm: The same of a torque [N m].
         gather_s: How long samples may wait for one another [s]: to wake for each of 1000 samples
@@ -192,6 +193,11 @@ class WrenchDevice(Device):
         if note is not None:
             self._has_zero, self._zero_at_start = True, False
             self._resume_zero(note)
+
+    def expect_load(self) -> None:
+        """A zero at the start would come too late: another gateway took it, and may be loaded."""
+        if self._zero_at_start:
+            self._has_zero, self._zero_at_start = True, False
 
     def _zero_note(self) -> bytes:
         """What ``_resume_zero`` needs of a zero that is not in the device."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -95,3 +96,24 @@ def test_a_broken_file_still_says_that_a_zero_was_taken(
         options = {"topic": emulator.topic, "connect": emulator.address, "zero_at_start": True}
         with bus.gateway(gateway("ros_wrench", options)):
             sensor(bus, SensorState.ZERO_LOST)
+
+
+def test_a_spare_that_takes_over_takes_no_load_for_its_zero(
+    bus: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(FILE_VARIABLE)  # gateways of two hosts
+    load = [fakes.CONSTANT]
+    with BotaEmulator(lambda t: load[0]) as emulator:
+        options = {"port": emulator.address, "rate_hz": 200, "zero_at_start": True}
+        values = gateway("wrench_bota", options)
+        with ExitStack() as stack:
+            first = stack.enter_context(bus.gateway(values))
+            sensor(bus, SensorState.LIVE)
+            stack.enter_context(bus.gateway(values, instance="spare"))
+            bus.until(lambda: [one for one in bus.statuses() if one.last_error is not None])
+            load[0] = PRESSED
+            first.stop.set()
+            sensor(bus, SensorState.ZERO_LOST)
+            np.testing.assert_allclose(
+                ask_zero(bus).force_before, np.subtract(PRESSED, fakes.CONSTANT)[:3], atol=0.05
+            )
