@@ -82,6 +82,7 @@ def test_the_newest_run_counts_and_one_that_has_ended_does_not() -> None:
     here = free_endpoint()
     ended = a_run(here)
     (ended / RUN_LOCK).unlink()
+    (ended / RUN_LOCK).touch()
     ended.rename(ended.with_name(f"99999999-999999-mine-{os.getpid()}"))
     assert expectation_here([here], "lab") is None
     finite = a_run(here, supervised=False)
@@ -95,7 +96,9 @@ def test_folders_of_ended_runs_go_although_a_process_has_their_id() -> None:
     """In a container every start has the same one."""
     runs = state_folder() / "runs"
     for number in range(2 * KEPT_RUNS):
-        (runs / f"20260101-{number:06d}-lab-{os.getpid()}").mkdir(parents=True)
+        ended = runs / f"20260101-{number:06d}-lab-{os.getpid()}"
+        ended.mkdir(parents=True)
+        (ended / RUN_LOCK).touch()
     running = new_run_folder("lab")
     running = running.rename(runs / f"20250101-000000-lab-{2**22 + 5}")
     other = runs / "0-somebody-elses"
@@ -220,3 +223,12 @@ def test_a_process_that_is_started_again_or_is_elsewhere_is_not_for_a_health_che
 def test_a_full_disk_of_state_is_told_with_a_remedy() -> None:
     with pytest.raises(ConfigError, match=r"No space left.*XDG_STATE_HOME"):
         write_run_file(Path("/dev/full"), "a profile")
+
+
+def test_a_run_of_an_older_palpate_is_told_by_its_process() -> None:
+    """It locks no file."""
+    runs = state_folder() / "runs"
+    going_on, ended = (runs / f"20260101-000000-lab-{pid}" for pid in (os.getpid(), 2**22 + 5))
+    for folder in (going_on, ended):
+        folder.mkdir(parents=True)
+    assert running_folders() == [going_on]

@@ -162,10 +162,21 @@ def _in_use(folder: Path) -> bool:
         with open(folder / RUN_LOCK, "rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except FileNotFoundError:
-        return not run_pid(folder)  # made by something else
+        pass  # of an older palpate, or made by something else
     except OSError:
         return True
-    return False
+    else:
+        return False
+    pid = run_pid(folder)
+    if not pid:
+        return True
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def write_profile(profile: Profile, folder: Path) -> Path:
