@@ -180,9 +180,9 @@ def plan_table(values: Mapping[str, Any]) -> str:
     waits = (last["phases"][phase] for phase in ("features", "electrodes"))
     told = " and ".join(f"{1e3 * one['p50_s']:.0f} ms" for one in waits)
     return (
-        f"{table}\nAt most {last['stations']} stations were measured; nothing is said of more than"
-        f" {largest}. With {last['stations']} and all else on those cores a message took {told} in"
-        " the median (estimates, raw frames): processor time says nothing of latency."
+        f"{table}\nAt most {last['stations']} stations were measured; we do not extrapolate beyond"
+        f" {largest}. Low processor time does not mean low latency: with {last['stations']} and all"
+        f" else on those cores a message took {told} in the median (estimates, raw frames)."
     )
 
 
