@@ -38,6 +38,12 @@ ROWS = RowSplit(*(np.arange(start, start + 4) for start in (0, 4, 8, 12)))
 FOLD = Fold("trajectory", "all units", "", ROWS)
 
 
+@pytest.fixture
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worker processes import this module for its tasks."""
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[3])
+
+
 def noise(rows: RowSplit, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(len(rows.test), 3))
 
@@ -126,6 +132,7 @@ def test_code_that_a_system_builds_on_is_in_its_name(
     assert cells.code_of(system) != before
 
 
+@pytest.mark.usefixtures("importable")
 @pytest.mark.parametrize("workers", [0, 2])
 def test_the_others_are_made_where_one_fails(
     tmp_path: Path, workers: int, caplog: pytest.LogCaptureFixture
@@ -153,6 +160,7 @@ class SlowTask(NoiseTask):
         return {"ignored": np.array(signal.getsignal(signal.SIGINT) == signal.SIG_IGN)}
 
 
+@pytest.mark.usefixtures("importable")
 def test_on_ctrl_c_nothing_begins_and_what_is_under_way_is_kept(tmp_path: Path) -> None:
     task = SlowTask(begun=tmp_path / "begun")
     task.begun.mkdir()
