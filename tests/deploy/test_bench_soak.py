@@ -32,6 +32,8 @@ from palpate_deploy.bench.soak import SoakResult, _Client
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
+PATIENCE_S = 20.0
+
 # Ends by itself: it must not outlive a test that is killed.
 _PROGRAM = """
 import os, sys, time
@@ -148,9 +150,11 @@ def test_frames_without_features_are_lost() -> None:
             SimpleNamespace(subscriber=lambda topic, **_: streams.get(topic.name, Stream([]))),
         )
     )
-    while sum(client.received.values()) < 12:
+    deadline = time.monotonic() + PATIENCE_S
+    while sum(client.received.values()) < 12 and time.monotonic() < deadline:
         time.sleep(0.01)
     client.close()
+    assert sum(client.received.values()) == 12
     assert {name: count for name, count in client.lost().items() if count} == {
         "client frames without features": 2
     }

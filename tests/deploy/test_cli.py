@@ -369,8 +369,13 @@ def test_json_logs(tmp_path: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert process.stderr is not None
-    first = json.loads(process.stderr.readline())
+    try:
+        assert process.stderr is not None
+        first = json.loads(process.stderr.readline())
+        process.send_signal(signal.SIGTERM)
+        _, rest = process.communicate(timeout=20)
+    finally:
+        process.kill()
     assert list(first)[:4] == ["time", "level", "logger", "message"]
     assert first["service"] == "router"
     assert first["pid"] == process.pid
@@ -378,8 +383,6 @@ def test_json_logs(tmp_path: Path) -> None:
     assert first["level"] == "info"
     assert first["logger"] == "palpate_deploy.station.processes"
     assert "router starts" in first["message"]
-    process.send_signal(signal.SIGTERM)
-    _, rest = process.communicate(timeout=20)
     assert process.returncode == 0
     assert "router ends" in rest
 

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,7 +37,13 @@ from palpate_fem.population.members import (
 )
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter
-from palpate_training.datasets.experiment import read_experiment, read_mixed
+from palpate_training.datasets.experiment import (
+    ExperimentDataset,
+    read_experiment,
+    read_mixed,
+    write_experiment,
+    write_mixed,
+)
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import joined
 from palpate_training.experiment.generate.fingertips import share_out
@@ -53,6 +59,7 @@ from palpate_training.experiment.generate.pipeline import (
     provenance_sha256,
 )
 from palpate_training.experiment.generate.pipeline import SPEC as SPEC_FILE
+from palpate_training.experiment.generate.sample import make_sample
 from palpate_training.experiment.generate.simulator import ExperimentSpec, Specimen
 from palpate_training.experiment.generate.trials import registration_errors
 from palpate_training.experiment.generate.workers import WorkerProcesses
@@ -632,10 +639,8 @@ def test_ray_that_is_not_there_is_said() -> None:
             RayCluster(address)
 
 
-def test_sample_is_small_and_playable_and_the_rest_lacks_it(
-    generated: GeneratedExperiment, tmp_path: Path
-) -> None:
-    """One normal and one angled press: here that is all there is, so nothing is left."""
+def test_sample_is_small_and_playable(generated: GeneratedExperiment, tmp_path: Path) -> None:
+    """One normal and one angled press: that is all there is, so a rest cannot be written."""
     words = ["sample", str(generated.folder), "--dataset", str(tmp_path / "s.h5")]
     words += ["--tape", str(tmp_path / "t.npz")]
     with pytest.raises(DatasetError, match="no trials of biotac-3"):
@@ -643,7 +648,7 @@ def test_sample_is_small_and_playable_and_the_rest_lacks_it(
     units = tmp_path / "units.json"
     write_population(units, members(), source="made by a test")
     words += ["--units", str(units)]
-    with pytest.raises(DatasetError):
+    with pytest.raises(DatasetError, match="no trials are given"):
         CliRunner().invoke(
             twin_app, [*words, "--rest", str(tmp_path / "rest")], catch_exceptions=False
         )
@@ -660,6 +665,40 @@ def test_sample_is_small_and_playable_and_the_rest_lacks_it(
     np.testing.assert_allclose(press.counts[0, 0], tape.specimens[0].rest_counts)
     assert np.linalg.norm(press.force[-1]) > np.linalg.norm(press.force[1])
     assert sum((tmp_path / name).stat().st_size for name in ("s.h5", "t.npz")) < 3e6
+
+
+def test_the_rest_is_all_that_the_sample_lacks(
+    generated: GeneratedExperiment, tmp_path: Path
+) -> None:
+    """The trials of one specimen get trajectories of their own, which a sample does not take."""
+    folder = tmp_path / "four"
+
+    def later(names: Sequence[str]) -> tuple[str, ...]:
+        return tuple(name.replace("/00/", "/01/") for name in names)
+
+    shutil.copytree(generated.folder, folder)
+
+    def parted(data: ExperimentDataset) -> ExperimentDataset:
+        return replace(
+            data,
+            trajectories=(*data.trajectories, *later(data.trajectories)),
+            indenters=2 * data.indenters,
+            trial_trajectory=data.trial_trajectory + 2 * data.trial_unit,
+        )
+
+    experiment, mixed = read_experiment(folder / EXPERIMENT), read_mixed(folder / MIXED)
+    write_experiment(folder / EXPERIMENT, parted(experiment))
+    write_mixed(folder / MIXED, replace(mixed, experiment=parted(mixed.experiment)))
+    dataset, tape, rest = tmp_path / "s.h5", tmp_path / "t.npz", tmp_path / "rest"
+    wanted, _ = make_sample(folder, specimens(), FemSimulator(), dataset, tape, rest)
+    assert set(wanted) == set(experiment.trajectories)
+    sampled = read_mixed(dataset).experiment
+    others = read_experiment(rest / EXPERIMENT), read_mixed(rest / MIXED).experiment
+    for whole, other in zip((experiment, mixed.experiment), others, strict=True):
+        assert set(other.trajectories) == set(later(wanted))
+        np.testing.assert_array_equal(other.tared, whole.tared[whole.row_unit == 1])
+    assert set(sampled.trajectories) == set(wanted)
+    assert len(sampled.tared) + len(others[1].tared) == len(mixed)
 
 
 @pytest.mark.parametrize("slow_starts", [1, 2])

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -34,16 +35,22 @@ def of(pid: int) -> list[str]:
     return [name for name in namespaces() if name.startswith(f"palpate-lab-{pid}-")]
 
 
-def lab(then: str) -> tuple[subprocess.Popen[str], int]:
+@contextlib.contextmanager
+def lab(then: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """A lab in a process of its own, and the process that sleeps in it."""
     process = subprocess.Popen(
         [sys.executable, "-c", LAB.format(then=then)],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
     )
-    assert process.stdout is not None
-    sleeper = int(process.stdout.readline())
-    return process, sleeper
+    try:
+        assert process.stdout is not None
+        yield process, int(process.stdout.readline())
+    finally:
+        process.kill()
+        process.wait(PATIENCE_S)
+        remove_leftovers()
 
 
 def lives(pid: int) -> bool:
@@ -58,25 +65,25 @@ def lives(pid: int) -> bool:
     ids=["ctrl-c", "failure"],
 )
 def test_nothing_is_left_of_a_lab(then: str, sent: signal.Signals | None) -> None:
-    process, sleeper = lab(then)
-    if sent is not None:
-        assert len(of(process.pid)) == 2
-        process.send_signal(sent)
-    assert process.wait(PATIENCE_S) != 0
-    assert of(process.pid) == []
-    assert not lives(sleeper)
+    with lab(then) as (process, sleeper):
+        if sent is not None:
+            assert len(of(process.pid)) == 2
+            process.send_signal(sent)
+        assert process.wait(PATIENCE_S) != 0
+        assert of(process.pid) == []
+        assert not lives(sleeper)
 
 
 def test_what_a_killed_lab_left_is_removed_by_the_next() -> None:
-    process, sleeper = lab("time.sleep(1000)")
-    process.kill()
-    process.wait(PATIENCE_S)
-    assert len(of(process.pid)) == 2
-    with HostLab() as next_lab:
-        assert of(process.pid) == []
-        assert not lives(sleeper)
-        assert next_lab.site in of(os.getpid())
-        assert remove_leftovers() == []  # that of a living process stays
+    with lab("time.sleep(1000)") as (process, sleeper):
+        process.kill()
+        process.wait(PATIENCE_S)
+        assert len(of(process.pid)) == 2
+        with HostLab() as next_lab:
+            assert of(process.pid) == []
+            assert not lives(sleeper)
+            assert next_lab.site in of(os.getpid())
+            assert remove_leftovers() == []  # that of a living process stays
     assert of(os.getpid()) == []
 
 

@@ -343,9 +343,11 @@ class TestQuestions:
             stderr=subprocess.STDOUT,
             text=True,
         )
-        assert process.stdout is not None
-        said = process.stdout.read()
-        assert process.wait(PATIENCE_S) == USAGE
+        try:
+            assert process.wait(PATIENCE_S) == USAGE
+        finally:
+            process.kill()
+            said, _ = process.communicate()
         assert "standard input is no terminal" in said
         assert "--biotac 'biotac_can channel=can0'" in said
         assert not list(lab.iterdir())

@@ -87,6 +87,21 @@ def test_a_client_joins_with_its_certificates_only(
         Client("tcp/192.0.2.1:7447", tls=own)
 
 
+def test_a_link_ends_with_its_certificate(
+    station: str, certificates: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(seconds=8)
+    monkeypatch.setattr(issuing, "_now", lambda: ends - datetime.timedelta(days=1))
+    own = issue(certificates, Role.ROBOT, "visitor", days=1)
+    with Client(station, tls=own, timeout_s=LIVE_S) as robot:
+        assert robot.session.has_router()
+        deadline = time.monotonic() + 8 + LIVE_S
+        while robot.session.has_router():
+            assert time.monotonic() < deadline, "the certificate has ended, the link has not"
+            time.sleep(0.05)
+        assert datetime.datetime.now(datetime.UTC) >= ends.replace(microsecond=0)
+
+
 def test_commands_join_with_certificates(station: str, certificates: Path) -> None:
     own = str(certificates / "operator")
     joined = ["--connect", station, "--tls", own]

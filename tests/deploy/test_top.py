@@ -218,7 +218,7 @@ def test_the_picture_shows_all_of_it(width: int) -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_largest_numbers_that_a_status_may_hold_are_shown(sign: float) -> None:
+def test_the_largest_numbers_that_a_status_may_hold_hide_nothing_else(sign: float) -> None:
     numbers = sign * GAUGE_MAX
     names = {"clock_quality", "clock_drift_ppm", "wall_synchronised", "wall_error_s", "tare_age_s"}
     seen = []
@@ -233,9 +233,19 @@ def test_the_largest_numbers_that_a_status_may_hold_are_shown(sign: float) -> No
             status = STATUS.decode(STATUS.encode(status))
         report = dataclasses.replace(one.report, status=status)
         seen.append(dataclasses.replace(one, report=report))
-    console = Console(file=io.StringIO(), width=160)
+    text = io.StringIO()
+    console = Console(file=text, width=160)
     console.print(screen("lab", seen, 160))
+    shown = text.getvalue()
+    assert max(map(len, shown.splitlines())) <= 160
+    begins = {tuple(line.split()[:2]) for line in shown.splitlines()}
+    assert {("features", "ready"), ("supervisor", "degraded"), ("thumb", "live")} <= begins
+    assert f"{2**64 - 1:,}" in shown
+    assert f"{1e3 * numbers:.0e}/{1e3 * numbers:.0e}" in shown
     _print(console, "lab", "", [one.report for one in seen], [])
+    listed = text.getvalue().removeprefix(shown)
+    assert max(map(len, listed.splitlines())) <= 160
+    assert f"frames_received {2**64 - 1:,}" in listed
     for value in (_as_json("lab", seen), snapshot("lab", seen, router=True, own=("web", "web"))):
         json.dumps(value, allow_nan=False)
 

@@ -130,16 +130,23 @@ def _installed(root: Path) -> dict[str, str]:
     return {path: what for path, what in contents(root).items() if not path.startswith(hidden)}
 
 
-def test_recordings_survive_every_killed_upgrade(root: Path, profile: Path) -> None:
+def test_recordings_survive_every_killed_upgrade(root: Path, profile: Path, tmp_path: Path) -> None:
     _first(root, profile)
     record = root / "var/lib/palpate/lab/runs/lab-1.mcap"
     record.parent.mkdir(parents=True)
     record.write_text("data")
+    ready = tmp_path / "ready"
+    shutil.copytree(root, ready, symlinks=True)
     for step in range(_STEPS_MAX):
-        act = _upgrade if step % 2 == 0 else _first
-        if not killed_at(step, root, lambda act=act: act(root, profile)):  # type: ignore[misc]
+        shutil.rmtree(root)
+        shutil.copytree(ready, root, symlinks=True)
+        killed = killed_at(step, root, lambda: _upgrade(root, profile))
+        assert record.read_text() == "data", f"killed before step {step}"
+        if not killed:
             break
-        assert record.read_text() == "data"
+        _upgrade(root, profile)
+        assert record.read_text() == "data", f"upgraded after a kill before step {step}"
+    assert 30 < step < _STEPS_MAX - 3
 
 
 def test_a_second_install_at_once_is_refused(root: Path, install: Install) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import logging
 import math
@@ -50,6 +51,19 @@ from palpate.messages import (
 def robot(link: LinkConfig) -> Iterator[Client]:
     with Client(link.connect[0], timeout_s=LIVE_S) as robot:
         yield robot
+
+
+@pytest.mark.parametrize(
+    ("method", "age_s"),
+    [
+        *((name, 0.05) for name in ("features", "electrodes")),
+        *((name, 0.2) for name in ("field", "synthesis")),
+        *((name, 0.2) for name in sorted(public_names(Client)) if name.startswith("stream_")),
+    ],
+)
+def test_by_default_old_readings_are_not_delivered(method: str, age_s: float) -> None:
+    parameters = inspect.signature(getattr(Client, method)).parameters
+    assert parameters["max_age_s"].default == age_s
 
 
 def test_a_stream_is_iterated_and_ends_when_it_is_closed(finger: Finger, robot: Client) -> None:

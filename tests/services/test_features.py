@@ -32,7 +32,11 @@ from palpate.messages import (
     Tare,
     TareRequest,
 )
-from palpate_services.config import FeaturesServiceConfig
+from palpate_services.config import (
+    FeaturesServiceConfig,
+    FieldServiceConfig,
+    SynthesisServiceConfig,
+)
 from palpate_services.inference.estimates import estimate
 from palpate_services.inference.model import Runtime
 from palpate_services.inference.services import run_estimating
@@ -41,6 +45,12 @@ Frames = Callable[..., ElectrodeFrame]
 Tares = Callable[..., Tare]
 Until = Callable[[Callable[[], bool]], None]
 Serve = Callable[..., AbstractContextManager[Session]]
+
+
+def test_by_default_old_messages_get_no_estimate() -> None:
+    """The ages that docs/tare-and-health.md names."""
+    configs = FeaturesServiceConfig(), FieldServiceConfig(), SynthesisServiceConfig()
+    assert [config.max_age_s for config in configs] == [0.05, 0.1, 0.2]
 
 
 @pytest.fixture

@@ -182,7 +182,8 @@ def test_a_recorder_without_retention_marks_nothing_and_removes_nothing(tmp_path
 def test_by_default_records_rotate_and_the_oldest_go() -> None:
     config = RecorderConfig()
     assert 0 < config.rotate_bytes < config.keep_bytes
-    assert 0 < config.rotate_s < config.keep_s
+    # As README.md, services/README.md and docs/install.md say.
+    assert (config.rotate_s, config.keep_bytes, config.keep_s) == (3600, 20 * 2**30, 14 * DAY_S)
     assert config.field_rate_hz == 0.5
 
 

@@ -259,13 +259,17 @@ def _number(value: float | None, scale: float = 1.0) -> str:
     if value is None:
         return "-"
     scaled = scale * value
-    return (
-        f"{scaled:.1f}" if scaled < 10.0 and abs(scaled - round(scaled)) > 0.05 else f"{scaled:.0f}"
-    )
+    tenths = scaled < 10.0 and abs(scaled - round(scaled)) > 0.05
+    return _fixed(scaled, 1 if tenths else 0)
 
 
 def _ms(seconds: float | None) -> str:
-    return "-" if seconds is None else f"{1e3 * seconds:.1f}"
+    return "-" if seconds is None else _fixed(1e3 * seconds, 1)
+
+
+def _fixed(value: float, digits: int) -> str:
+    """With digits after the point; an absurd value must not take the room of names and states."""
+    return f"{value:.{digits}f}" if abs(value) < 1e7 else f"{value:.0e}"
 
 
 def _as_json(
