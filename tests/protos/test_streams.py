@@ -159,7 +159,8 @@ def test_a_full_queue_counts_what_it_refuses(
     for sequence in range(1, 31):
         publisher.put(frame_of(sequence))
     wait_until(lambda: subscriber.counters.get("received") == 30)
-    assert [subscriber.next(PATIENCE_S).message.stamp.sequence for _ in range(10)] == list(range(1, 11))
+    got = [subscriber.next(PATIENCE_S).message.stamp.sequence for _ in range(10)]
+    assert got == list(range(1, 11))
     assert subscriber.counters["overflow"] == 20
 
 
@@ -174,8 +175,8 @@ def test_latest_never_returns_an_old_reading(
     wait_until(publisher.matched)
     publisher.put(frame_of(1))
     wait_until(lambda: subscriber.counters.get("received"))
-    assert subscriber.latest(max_age_s=PATIENCE_S).message.stamp.sequence == 1
-    assert subscriber.latest(max_age_s=PATIENCE_S).message.stamp.sequence == 1  # nothing was consumed
+    for _ in range(2):  # nothing is consumed
+        assert subscriber.latest(max_age_s=PATIENCE_S).message.stamp.sequence == 1
     # Old by its stamp though it has just arrived.
     old_ns = time.monotonic_ns() - round(2e9 * PATIENCE_S)
     publisher.put(frame_of(2, monotonic_ns=old_ns))
