@@ -40,6 +40,8 @@ QUICK, SLOW, STUBBORN, DIES, SEGFAULTS, DIVERGES, REFUSES, DEFECTIVE, PINCHES, N
 UNSOLVED, APART = 0.2, 0.21
 """A device does not solve paths with an odd number of steps, and gives up after two; APART: its
 forces are other than those of the CPU, too."""
+HELD = 0.22
+"""Makes two steps, and goes on when it is told to stop."""
 SLOW_STEP_S = 0.12
 MOST_SLOTS = 100
 HALF = 0.007  # the finger is a cube of 14 mm
@@ -121,6 +123,8 @@ class FakeTip:
         steps: list[IndentationStep] = []
         outcome, reason = IndentationOutcome.COMPLETE, ""
         for k in range(1, len(path)):
+            while k == 3 and kind == HELD and should_stop is not None and should_stop() is None:
+                time.sleep(0.01)
             stopped = None if should_stop is None else should_stop()
             if stopped is not None:
                 outcome, reason = stopped, f"stopped at step {k}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import math
@@ -486,13 +487,17 @@ def test_a_stopped_sweep_keeps_what_has_ended(stop: signal.Signals, tmp_path: Pa
         "run", "--sweep", "--indenter", "cube", "--steps", 5, "--store", store, "--friction",
         fakes.SLOW, "--workers", 2,
     )  # fmt: skip
-    deadline = time.monotonic() + PATIENCE_S
-    while len(list(store.rglob("normal.h5"))) < 1:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    # To the workers, too, as a terminal, `timeout` and a cluster's scheduler do.
-    os.killpg(process.pid, stop)
-    output, errors = process.communicate(timeout=PATIENCE_S)
+    try:
+        deadline = time.monotonic() + PATIENCE_S
+        while len(list(store.rglob("normal.h5"))) < 1:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        # To the workers, too, as a terminal, `timeout` and a cluster's scheduler do.
+        os.killpg(process.pid, stop)
+        output, errors = process.communicate(timeout=PATIENCE_S)
+    finally:
+        with contextlib.suppress(ProcessLookupError):  # all have ended
+            os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 1
     assert "the same command goes on" in output
     assert "failed" not in output

@@ -7,7 +7,6 @@ import importlib
 import os
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -356,16 +355,16 @@ def test_a_killed_sweep_leaves_no_process_and_a_good_store(tmp_path: Path) -> No
     store, script = tmp_path / "a.sim", tmp_path / "script.py"
     folders = [str(Path(__file__).parents[up]) for up in (0, 2)]
     script.write_text(KILLED.format(folders=folders, store=str(store)))
-    process = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
-    deadline = time.monotonic() + PATIENCE_S
-    while len(list(store.rglob("*normal.h5"))) < 3:
-        assert time.monotonic() < deadline, "nothing was written"
-        time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    while sweeps._members(process.pid):
-        assert time.monotonic() < deadline, "processes outlive the one who started them"
-        time.sleep(0.02)
+    with sweeps.group_of(sys.executable, str(script)) as process:
+        deadline = time.monotonic() + PATIENCE_S
+        while len(list(store.rglob("*normal.h5"))) < 3:
+            assert time.monotonic() < deadline, "nothing was written"
+            time.sleep(0.02)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        while sweeps._members(process.pid):
+            assert time.monotonic() < deadline, "processes outlive the one who started them"
+            time.sleep(0.02)
     done = len(SimulationStore.open(store).done())
     assert 3 <= done < 90
     report, there = into_store(store, batch_of(fakes.SLOW), rest(store, short(90), 2))

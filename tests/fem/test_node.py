@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import threading
@@ -237,9 +238,12 @@ def test_an_early_end_keeps_what_converged(
 
 
 def test_a_deadline_keeps_what_converged(service: Any) -> None:
-    reply = service.robot.simulate(fakes.request("late", fakes.SLOW, steps=100), timeout_s=1.0)
+    for timeout_s in (1.0, 5.0, PATIENCE_S):  # a busy host may make no step in a second
+        with contextlib.suppress(RemoteError, StreamTimeout):
+            reply = service.robot.simulate(fakes.request("late", fakes.HELD), timeout_s=timeout_s)
+            break
     assert reply.outcome is SimulationOutcome.DEADLINE
-    assert 1 <= len(reply.steps) < 100
+    assert 1 <= len(reply.steps) <= 2
 
 
 def test_a_deadline_before_any_step_is_an_error(service: Any) -> None:
@@ -256,13 +260,13 @@ def test_no_time_at_all_is_a_timeout(service: Any) -> None:
 def test_a_cancelled_simulation_keeps_what_converged(service: Any) -> None:
     first = threading.Event()
     thread, out = service.in_thread(
-        fakes.request("cancelled", fakes.SLOW, steps=50), on_step=lambda *_: first.set()
+        fakes.request("cancelled", fakes.HELD), on_step=lambda *_: first.set()
     )
     assert first.wait(PATIENCE_S)
     assert service.robot.cancel_simulation("cancelled")
     thread.join(PATIENCE_S)
     assert out[0].outcome is SimulationOutcome.CANCELLED
-    assert 1 <= len(out[0].steps) < 50
+    assert 1 <= len(out[0].steps) <= 2
     assert not service.robot.cancel_simulation("cancelled")
 
 
@@ -270,9 +274,7 @@ def occupied(service: Any, count: int) -> list[tuple[threading.Thread, list[Any]
     """So many simulations that run or wait, named ``many <k>``."""
     # The service is ready with its first worker; until the second is, one fewer is accepted.
     service.until(lambda: service.robot.status()[0].gauges["ready_workers"] == 2)
-    asked = [
-        service.in_thread(fakes.request(f"many {k}", fakes.SLOW, steps=100)) for k in range(count)
-    ]
+    asked = [service.in_thread(fakes.request(f"many {k}", fakes.HELD)) for k in range(count)]
 
     def all_there() -> bool:
         gauges = service.robot.status()[0].gauges
@@ -300,7 +302,7 @@ def test_time_in_the_queue_counts(service: Any) -> None:
     asked = occupied(service, 2)
     told: list[SimulationProgress] = []
     with pytest.raises(RemoteError, match="while it waited") as caught:
-        service.robot.simulate(fakes.request("waits"), timeout_s=0.2, on_progress=told.append)
+        service.robot.simulate(fakes.request("waits"), timeout_s=1.0, on_progress=told.append)
     assert caught.value.code is ErrorCode.DEADLINE_EXCEEDED
     assert told[0].phase is SimulationPhase.WAITING
     for k, (thread, _) in enumerate(asked):
@@ -320,7 +322,7 @@ def test_nobody_waits_for_it_any_more(service: Any) -> None:
             raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            leaving.simulate(fakes.request("left alone", fakes.SLOW, steps=200), on_step=interrupt)
+            leaving.simulate(fakes.request("left alone", fakes.HELD), on_step=interrupt)
 
     thread = threading.Thread(target=ask)
     thread.start()

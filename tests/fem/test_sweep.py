@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import importlib
 import os
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -255,20 +257,32 @@ def test_a_killed_sweep_leaves_no_process_and_a_good_store(tmp_path: Path) -> No
     store = tmp_path / "a.sim"
     script = tmp_path / "script.py"
     script.write_text(KILLED.format(folder=str(Path(__file__).parent), store=str(store)))
-    process = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
-    deadline = time.monotonic() + 60
-    while len(list(store.rglob("*normal.h5"))) < 2:
-        assert time.monotonic() < deadline, "nothing was written"
-        time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    while _members(process.pid):
-        assert time.monotonic() < deadline, "workers outlive the one who started them"
-        time.sleep(0.02)
+    with group_of(sys.executable, str(script)) as process:
+        deadline = time.monotonic() + 60
+        while len(list(store.rglob("*normal.h5"))) < 2:
+            assert time.monotonic() < deadline, "nothing was written"
+            time.sleep(0.02)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        while _members(process.pid):
+            assert time.monotonic() < deadline, "workers outlive the one who started them"
+            time.sleep(0.02)
     done = len(SimulationStore.open(store).done())
     assert done >= 2
     report, there = into_store(store, fakes.SLOW, done + 1, threading.Event())
     assert (report.done, there) == (1, done)
+
+
+@contextlib.contextmanager
+def group_of(*command: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A process with a group of its own, of which nothing is left at the end."""
+    process = subprocess.Popen(command, start_new_session=True)
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):  # all have ended
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 def _members(group: int) -> list[int]:

@@ -166,7 +166,8 @@ class Running:
         self.error: BaseException | None = None
         self._config = parse_config(GatewayConfig, values, where="test")
         self._link = link
-        self.thread = threading.Thread(target=self._run)
+        # One that cannot be stopped must not keep the run of the tests from ending.
+        self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
 
     def _run(self) -> None:

@@ -247,15 +247,7 @@ def test_no_router() -> None:
 
 
 def test_a_gateway_that_waits_for_a_service_can_be_stopped(bus: Any) -> None:
-    stop = threading.Event()
     values = {"sensors": [{"driver": "virtual"}], "wait_for": ["features"]}
-    config = parse_config(GatewayConfig, values, where="test")
-
-    def end_it() -> None:
+    with bus.gateway(values) as running:
         bus.until(bus.status)
-        stop.set()
-
-    ending = threading.Thread(target=end_it)
-    ending.start()
-    node.run(config, bus.link, "lab", stop)
-    ending.join(PATIENCE_S)
+    assert running.error is None

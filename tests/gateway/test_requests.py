@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,6 +18,7 @@ from palpate.client.estimates import ask_tare
 from palpate.errors import ErrorCode, RemoteError
 from palpate.messages import ServiceState, TareRequest
 from palpate_gateway.service.requests import MOST
+from palpate_gateway.virtual.faults import FaultPlan
 
 PATIENCE_S = 20.0
 RATE_HZ = 200
@@ -139,22 +139,27 @@ def test_callers_of_others_end_nothing(bus: Any, finger: dict[str, Any]) -> None
             assert tare.result(PATIENCE_S).frames_averaged == RATE_HZ
 
 
-def test_requests_end_with_the_sensor(bus: Any, tape_path: Callable[..., Path]) -> None:
+def test_requests_end_with_the_sensor(
+    bus: Any, tape_path: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Not with an average over frames of before and after."""
-    options = {
-        "tape": str(tape_path()),
-        "rate_hz": RATE_HZ,
-        "untouched_s": 600,
-        "faults": [{"kind": "restart", "at_s": 3.0}],
-    }
+    due = [False]
+
+    def restart(_: FaultPlan, tick: int) -> int | None:
+        now, due[0] = due[0], False
+        return 0 if now else None
+
+    monkeypatch.setattr(FaultPlan, "restart", restart)
+    options = {"tape": str(tape_path()), "rate_hz": RATE_HZ, "untouched_s": 600}
     values = {"sensors": [{"driver": "virtual", "options": options}], "tare_frames": 20}
-    with bus.gateway(values):
+    with bus.gateway(values), ThreadPoolExecutor(1) as pool:
         bus.state(ServiceState.READY)
-        began_s = time.monotonic()
+        asked = pool.submit(bus.ask_tare, "finger", 0, 10 * RATE_HZ)
+        bus.until(lambda: threads_named("tare of finger") == 1)
+        due[0] = True
         with pytest.raises(RemoteError, match="not tared: ") as caught:
-            bus.ask_tare("finger", frames=10 * RATE_HZ)
+            asked.result(PATIENCE_S)
         assert caught.value.code is ErrorCode.DEVICE
-        assert time.monotonic() - began_s < 10.0
         bus.session.subscriber(ELECTRODES).next(PATIENCE_S)
         bus.state(ServiceState.READY)
         assert bus.ask_tare("finger", frames=10).frames_averaged == 10

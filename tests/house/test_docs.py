@@ -93,8 +93,6 @@ def test_make_bench_runs_programs_that_need_no_options() -> None:
 @pytest.fixture(scope="module")
 def command() -> Any:
     """The tree of `palpate` commands."""
-    if importlib.util.find_spec("palpate_deploy.cli.app") is None:
-        pytest.skip("palpate_deploy.cli.app does not exist")
     typer = importlib.import_module("typer")
     cli = importlib.import_module("palpate_deploy.cli.app")
     return typer.main.get_command(cli.app)

@@ -57,6 +57,17 @@ PLANTS = [
     ("services/palpate_services/planted.py", "import warp", "Warp stays in fem"),
     ("fem/palpate_fem/indenter/planted.py", "import palpate_fem.store", "Inside fem"),
     ("protos/palpate/messages/planted.py", "import palpate.bus", "Inside palpate"),
+    (
+        "training/palpate_training/datasets/planted.py",
+        "import palpate_training.learning",
+        "Inside training",
+    ),
+    ("gateway/palpate_gateway/ports/planted.py", "import palpate_gateway.tare", "Inside gateway"),
+    (
+        "gateway/palpate_gateway/emulators/planted.py",
+        "import palpate_gateway.protocols",
+        "Emulators are written from the page",
+    ),
 ]
 
 
@@ -135,6 +146,12 @@ def test_planted_violation_is_caught(
     assert result.returncode == 1, result.stdout + result.stderr
     broken = [text for text in result.stdout.splitlines() if text.endswith("BROKEN")]
     assert any(contract in text for text in broken), result.stdout
+
+
+def test_every_contract_has_a_planted_violation() -> None:
+    words = [word for _, _, word in PLANTS]
+    names = [contract["name"] for contract in LINTER["contracts"]]
+    assert not [name for name in names if not any(word in name for word in words)]
 
 
 @functools.cache  # each package below looks at every file

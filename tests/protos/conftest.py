@@ -302,7 +302,7 @@ def frame_of(examples: dict[str, Any]) -> Callable[..., ElectrodeFrame]:
 
 @pytest.fixture
 def wait_until() -> Callable[..., None]:
-    def wait(condition: Callable[[], object], timeout_s: float = 5.0) -> None:
+    def wait(condition: Callable[[], object], timeout_s: float = 20.0) -> None:
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, "did not happen in time"

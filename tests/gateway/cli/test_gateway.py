@@ -208,10 +208,14 @@ def test_ctrl_c_ends_the_monitor(kms40: Kms40Emulator) -> None:
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert process.stdout is not None
-    assert json.loads(process.stdout.readline())["state"] == "open"
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=PATIENCE_S)
+    try:
+        assert process.stdout is not None
+        assert json.loads(process.stdout.readline())["state"] == "open"
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+        process.wait()
     assert (process.returncode, errors) == (0, "")
     assert not kms40.streaming
 

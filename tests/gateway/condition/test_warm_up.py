@@ -24,7 +24,10 @@ def test_nothing_is_said_before_there_is_a_slope() -> None:
     assert not warm_up.warming
 
 
-@pytest.mark.parametrize(("slope", "warming"), [(7.0, False), (-7.0, False), (60.0, True)])
+@pytest.mark.parametrize(
+    ("slope", "warming"),
+    [(7.0, False), (-7.0, False), (27.0, False), (33.0, True), (60.0, True), (-60.0, True)],
+)
 def test_steep_is_warming_up(slope: float, warming: bool) -> None:
     warm_up = WarmUp()
     follow(warm_up, slope, 20.0)
@@ -32,12 +35,13 @@ def test_steep_is_warming_up(slope: float, warming: bool) -> None:
     assert warm_up.warming is warming
 
 
-def test_it_settles_when_the_slope_is_flat_not_before() -> None:
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_it_settles_when_the_slope_is_flat_not_before(sign: float) -> None:
     warm_up = WarmUp()
-    tdc = follow(warm_up, 60.0, 40.0)
-    tdc = follow(warm_up, 20.0, 2 * WINDOW_S, begin_s=40.0, tdc=tdc)
+    tdc = follow(warm_up, sign * 60.0, 40.0)
+    tdc = follow(warm_up, sign * 17.0, 2 * WINDOW_S, begin_s=40.0, tdc=tdc)
     assert warm_up.warming
-    follow(warm_up, 5.0, 2 * WINDOW_S, begin_s=40.0 + 2 * WINDOW_S, tdc=tdc)
+    follow(warm_up, sign * 13.0, 2 * WINDOW_S, begin_s=40.0 + 2 * WINDOW_S, tdc=tdc)
     assert not warm_up.warming
 
 

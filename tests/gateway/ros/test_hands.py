@@ -142,11 +142,17 @@ def test_damaged_bytes_are_a_typed_error_or_a_message(
     payload = bytearray(message.serialize())
     for _ in range(3):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.one_of(st.just(len(payload)), st.integers(0, len(payload))))
     try:
-        hand = decode_hand(bytes(payload[: data.draw(st.integers(0, len(payload)))]), BIOTAC_ALL)
+        hand = decode_hand(bytes(payload[:cut]), BIOTAC_ALL)
     except WireError:
         return
-    FingerTrack(1, rate_hz=100.0).take(hand)
+    reading = FingerTrack(1, rate_hz=100.0).take(hand)
+    if reading is None:
+        return
+    values = [*reading.electrodes, reading.pdc, reading.tac, reading.tdc, *reading.pac]
+    valid = [value for bit, value in enumerate(values) if reading.validity >> bit & 1]
+    assert all(0 <= value <= 4095 for value in valid)
 
 
 class TestTrack:

