@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.errors import DatasetError
+from palpate.errors import ConfigError, DatasetError
 from palpate.files.bundle import read_bundle
 from palpate_training.cli import data_app, train_app
 from palpate_training.datasets.features import FeatureDataset, cut_into_blocks, write_dataset
@@ -159,8 +159,8 @@ def test_a_report_that_cannot_be_written_is_told_before_the_trainings(
     monkeypatch.setattr(force_real, "run_force_real", lambda *_, **__: pytest.fail("trained"))
     words = ["force-real", "--data", str(tmp_path / "two.h5"), "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(train_app, words)
-    assert isinstance(result.exception, DatasetError)
-    assert f"cannot write to {tmp_path / 'out'}" in result.exception.problem
+    assert isinstance(result.exception, ConfigError)
+    assert f"{tmp_path / 'out'} is no folder" in result.exception.problem
 
 
 def test_published_results_meet_the_target() -> None:

@@ -238,16 +238,12 @@ def train_force_real(
 
     palpate train force-real --data lasa.h5 --out docs/results
     """
-    from palpate_training.tasks.force_real import (
-        experiment_count,
-        run_force_real,
-        try_folder,
-        write_report,
-    )
+    from palpate.files.outputs import check_folder
+    from palpate_training.tasks.force_real import experiment_count, run_force_real, write_report
     from palpate_training.tasks.results import rich_table
 
     dataset = open_dataset(data)
-    try_folder(out)
+    check_folder(out, "--out")
     with _progress() as progress:
         task = progress.add_task("networks", total=experiment_count(dataset, seeds))
         report = run_force_real(dataset, seeds=seeds, on_network=lambda: progress.advance(task))

@@ -10,7 +10,6 @@ trained on the other finger. Longer and shorter blocks are reported beside.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -225,22 +224,6 @@ chosen on validation blocks and then kept; all models learn from all blocks that
 Each validation block is a test block of another fold: of 20 blocks ten are, so the settings were
 chosen on half of the test rows, and the errors may be somewhat too small.
 """
-
-
-def try_folder(folder: Path) -> None:
-    """Make the folder of a report, and write to it, before trainings take minutes.
-
-    Raises:
-        DatasetError: That is not possible.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise DatasetError(
-            f"cannot write to {folder}: {error}", remedy="name another folder with --out"
-        ) from error
 
 
 def write_report(folder: Path, report: ForceReport, *, command: str) -> None:
