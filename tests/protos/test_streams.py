@@ -52,7 +52,7 @@ def test_newest_wins_and_the_dropped_are_counted_but_not_as_lost(
 ) -> None:
     a, b = pair
     subscriber = b.subscriber(ELECTRODES, delivery=Delivery.NEWEST)
-    fingers = [a.publisher(ELECTRODES, sensor=name) for name in ("left", "right")]
+    fingers = [a.publisher(ELECTRODES, sensor=name, lossless=True) for name in ("left", "right")]
     wait_until(lambda: all(p.matched() for p in fingers))
     for sequence in range(1, 21):
         for publisher in fingers:
@@ -74,7 +74,7 @@ def test_a_deeper_newest_keeps_the_last_few_in_order(
 ) -> None:
     a, b = pair
     subscriber = b.subscriber(ELECTRODES, delivery=Delivery.NEWEST, depth=3)
-    publisher = a.publisher(ELECTRODES, sensor="finger")
+    publisher = a.publisher(ELECTRODES, sensor="finger", lossless=True)
     wait_until(publisher.matched)
     for sequence in range(1, 11):
         publisher.put(frame_of(sequence))
@@ -154,7 +154,7 @@ def test_a_full_queue_counts_what_it_refuses(
 ) -> None:
     a, b = pair
     subscriber = b.subscriber(ELECTRODES, delivery=Delivery.QUEUE, capacity=10)
-    publisher = a.publisher(ELECTRODES, sensor="finger")
+    publisher = a.publisher(ELECTRODES, sensor="finger", lossless=True)
     wait_until(publisher.matched)
     for sequence in range(1, 31):
         publisher.put(frame_of(sequence))
@@ -194,7 +194,7 @@ def test_duplicates_are_dropped_and_a_restarted_sender_is_followed(
 ) -> None:
     a, b = pair
     subscriber = b.subscriber(ELECTRODES, delivery=Delivery.QUEUE)
-    publisher = a.publisher(ELECTRODES, sensor="finger")
+    publisher = a.publisher(ELECTRODES, sensor="finger", lossless=True)
     wait_until(publisher.matched)
     first, fifth = frame_of(1), frame_of(5)
     for frame in (first, fifth, frame_of(6), fifth, first, frame_of(1), frame_of(2)):
@@ -274,7 +274,7 @@ def test_how_many_wait_is_known(
     a, b = pair
     stream = b.subscriber(ELECTRODES, delivery=delivery, depth=3)
     tap = b.tap([ELECTRODES])
-    publisher = a.publisher(ELECTRODES, sensor="finger")
+    publisher = a.publisher(ELECTRODES, sensor="finger", lossless=True)
     wait_until(publisher.matched)
     for sequence in range(1, 4):
         publisher.put(frame_of(sequence))
