@@ -10,8 +10,6 @@ same. Of the bundles that ship, operators, operator set, size and parity are lis
 from __future__ import annotations
 
 import json
-import os
-import platform
 import sys
 import time
 from collections.abc import Iterator
@@ -25,6 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from palpate.anatomy import ELECTRODE_POSITIONS
+from palpate_deploy.bench.results import machine
 from palpate_training.datasets.experiment import read_mixed
 from palpate_training.datasets.features import ELECTRODES
 from palpate_training.figures.style import markdown_table
@@ -42,6 +41,7 @@ from palpate_training.systems import latent, ours, perceptrons, points, ruppel, 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results" / "networks.md"
 RESULTS = PAGE.with_suffix(".json")
+FASTER_HOST = RESULTS.with_stem("networks-faster-host")
 MODELS = ROOT / "services" / "palpate_services" / "models"
 SAMPLE = ROOT / "training" / "palpate_training" / "samples" / "twin.h5"
 
@@ -203,8 +203,7 @@ def main() -> None:
     ]
     values = {
         "schema": "palpate.networks 1",
-        "cpu": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
+        "machine": machine(),
         "onnxruntime": onnxruntime.__version__,
         "bundles": bundles,
         "networks": networks,
@@ -215,15 +214,29 @@ def main() -> None:
 
 
 def page(values: dict[str, Any]) -> str:
-    """The page of the JSON."""
+    """The page of the JSON, with the times of an earlier run on a faster host."""
+    earlier = json.loads(FASTER_HOST.read_text(encoding="utf-8"))["bundles"]
+    faster = {one["name"]: f"{one['ms']:.2f}" for one in earlier}
+    host = values["machine"]
     bundles = markdown_table(
-        ("bundle", "task", "MB", "ms a frame", "goal", "parity", "opset", "operators"),
+        (
+            "bundle",
+            "task",
+            "MB",
+            "ms a frame",
+            "faster host",
+            "goal",
+            "parity",
+            "opset",
+            "operators",
+        ),
         [
             (
                 f"`{one['name']}` {one['version']}",
                 one["task"],
                 f"{one['megabytes']:.1f}",
                 f"{one['ms']:.2f}",
+                faster.get(one["name"], ""),
                 f"{GOAL_MS[one['task']]:g}",
                 f"{one['parity']:.0e}",
                 str(one["opset"]),
@@ -243,10 +256,13 @@ def page(values: dict[str, Any]) -> str:
     return (
         "# What each network costs\n\n"
         "Made by `python docs/make_networks.py`: ONNX Runtime"
-        f" {values['onnxruntime']} on one thread, one frame after the other, median.\n\n"
+        f" {values['onnxruntime']} on one thread, one frame after the other, median; {host['cpus']}"
+        f" cores, {host['cpu']}.\n\n"
         "## Bundles that ship\n\n"
         f"{total:.1f} MB in all (goal 25). Parity: largest difference between torch and ONNX"
-        " Runtime, over what is allowed ([ADR 8](../adr/0008-bundle.md)).\n\n"
+        " Runtime, over what is allowed ([ADR 8](../adr/0008-bundle.md)). Weights are stored in"
+        " half precision, and take twice the room in memory: a processor whose caches do not hold"
+        " them reads them for each frame. *Faster host*: an earlier run with versions of the same size.\n\n"
         f"{bundles}\n"
         "## Networks of the study\n\n"
         "Networks that estimate modes or read them, without the modes themselves; our film network"
