@@ -254,9 +254,9 @@ def avoid_pauses() -> None:
 
     A full garbage collection visits every object of every imported module, which takes 10 ms or
     more: the whole period of a frame. These objects live as long as the process, so the collector
-    is told to ignore them (``gc.freeze``). And ``np.percentile`` imports ``numpy.ma`` at its first
-    call, which takes 40 to 80 ms: every service lost up to three frames by its first report.
+    is told to ignore them (``gc.freeze``). What NumPy imports late is imported now.
     """
+    # ``np.percentile`` imports it at its first call, for 40 to 80 ms: a first report lost frames.
     importlib.import_module("numpy.ma")
     gc.collect()
     gc.freeze()

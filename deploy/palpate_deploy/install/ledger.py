@@ -21,6 +21,7 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from palpate.config import StrictConfig
 from palpate.errors import PalpateError
+from palpate.files.atomic import sync_folder
 from palpate_deploy.install.units import (
     PROFILES_FOLDER,
     UNITS_FOLDER,
@@ -401,6 +402,4 @@ def _stage(file: Path, text: str, *, mode: int = 0o644) -> Path:
 def _write(file: Path, text: str, *, mode: int = 0o644) -> None:
     _stage(file, text, mode=mode).replace(file)
     # What is renamed after this must not reach the disk before it.
-    folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY)
-    os.fsync(folder)
-    os.close(folder)
+    sync_folder(file.parent)

@@ -13,6 +13,7 @@ import os
 from pathlib import Path
 
 from palpate.errors import DatasetError, ErrorCode
+from palpate.files.atomic import sync_folder
 from palpate.files.simulation_store import SUFFIX
 from palpate.process import Closing
 
@@ -183,15 +184,6 @@ class FolderLock:
             os.pwrite(self._file, text.encode("ascii"), 0)
         except OSError:
             return
-
-
-def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to the disk; else a power cut may undo a renaming."""
-    file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)
 
 
 def _make_folder(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Writing files and folders atomically: one appears complete or not at all."""
+"""Writing files and folders: one appears complete or not at all, and outlasts a power failure."""
 
 from __future__ import annotations
 
@@ -38,3 +38,20 @@ def written_whole(path: Path) -> Iterator[Path]:
                 shutil.rmtree(partial)
             else:
                 partial.unlink(missing_ok=True)
+
+
+def write_synced(path: Path, content: bytes) -> None:
+    """Write a new file, and bring it to the disk: what is renamed then outlasts a power failure."""
+    with open(path, "xb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to the disk; else a power failure may undo a renaming."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

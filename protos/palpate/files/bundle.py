@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import BundleError, printable
+from palpate.files.atomic import sync_folder, write_synced
 from palpate.files.bounded import arrays_of_npz, read_regular
 from palpate.files.manifest import Manifest, check_task, manifest_to_bytes, parse_manifest
 from palpate.files.tasks import check_tensors
@@ -247,16 +248,9 @@ def write_bundle(
         folder.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         for name, data in (*files.items(), (MANIFEST, text)):
-            with open(temporary / name, "xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())  # what is renamed must outlast a power failure
+            write_synced(temporary / name, data)
         temporary.chmod(0o755)
-        handle = os.open(temporary, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        sync_folder(temporary)
         os.rename(temporary, folder)
     except OSError as error:
         raise BundleError(f"cannot write {folder}: {error}", remedy="check the disk") from error

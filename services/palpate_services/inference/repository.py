@@ -11,6 +11,7 @@ from pathlib import Path
 
 from palpate.config import check_name
 from palpate.errors import BundleError, ConfigError
+from palpate.files.atomic import sync_folder, write_synced
 from palpate.files.bundle import (
     GOLDEN,
     MANIFEST,
@@ -236,10 +237,8 @@ def _copied(source: Path, target: Path) -> Path:
     for name in (MODEL, MANIFEST, GOLDEN, MESH, RANGE, SIGNATURE):
         if name in (MESH, RANGE, SIGNATURE) and not (source / name).exists():
             continue
-        with open(target / name, "xb") as file:
-            file.write(read_file(source, name))
-            file.flush()
-            os.fsync(file.fileno())  # what is renamed afterwards must outlast a power failure
+        write_synced(target / name, read_file(source, name))
+    sync_folder(target)
     return target
 
 
