@@ -136,7 +136,7 @@ def _other_hosts() -> str:
     return (
         "\n**Other hosts, and a larger network.** `features-twin`, which the profile `virtual` "
         "serves, has weights of 11 MB, which the processor has to fetch for each frame "
-        "(`palpate bench e2e --bundle features-twin`).\n\n"
+        "(`palpate bench e2e --runs N`, with `--bundle features-twin` where it is named).\n\n"
         + _table(
             "host | bundle | runs | p50, p99 | floor | ratios (goals 1.15, 1.3) | lost "
             "| 40 fingers: lost",
