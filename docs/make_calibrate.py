@@ -290,7 +290,7 @@ def page(facts: dict[str, Any]) -> str:
         for shots, found in by_shots.items()
         for name, one in found.items()
     ]  # fmt: skip
-    head = ["specimens", "number", *names, "the last is chosen", "its location"]
+    head = ["specimens", "number", *names, "how often this network is chosen", "its location"]
     twin = [one["unlike"] for cells in facts["simulated"].values() for one in cells]
     others = [one["unlike"] for one in facts["real"]]
     like = [one["unlike_others"] for one in facts["real"]]
@@ -330,7 +330,11 @@ below, and {real_least:.2f} to {real_most:.2f} on the real fingers.
 
 Specimens of the twin; the [population's network](population.md) was trained neither on them nor on
 their skin. Median error of the force on all presses that were not learned from, and from 2 N in
-percent of the force; means over specimens and {facts["draws"]} draws of the presses. A force/torque
+percent of the force; means over specimens and {facts["draws"]} draws of the presses. *Line*: linear
+fit on tared counts. *Gaussian processes*: the mean of the line and two of them; with a larger
+*locality* a
+press counts for less where signals are unlike its own. *Told by the presses*: the network gets the
+finger's presses as input. A force/torque
 sensor does not measure where a finger is touched; the network estimates it (the last column is the
 median error of the contact location).
 `features-twin`, which was trained on the three that ship, has {own_n:.3f} N and

@@ -71,8 +71,8 @@ Corrected:
 Not corrected:
 
 * Other processes notice that a process hangs only after the lease of a link, which is 2 s by
-  default; the reference measured with 1 s. On a busy host a shorter lease closes links that are
-  well.
+  default; the goal of 1.5 s assumes a lease of 1 s. On a busy host a shorter lease closes links
+  that are well.
 * On a machine that is busy with other things, everything that starts Python again waits for a
   processor: the whole stack after a kill of its unit, and the finite elements. On an idle one
   `palpate bench restart` finds 1 to 3 s ([serving](serving.md)).
@@ -189,8 +189,8 @@ def page(found: dict[str, Any]) -> str:
         f"\n## What must hold\n\n{_goals(found)}"
         f"\n## What the robot had\n\n{_availability(found)}"
         f"\n## Each fault\n\n*Over* counts from the fault, or from its end if it lasts, until what "
-        "it broke works again: estimates, the process's token, its status, or an answer. Goals are "
-        "those of the serving reference, or this project's own.\n\n"
+        "it broke works again: estimates, the process's token, its status, or an answer. Goals "
+        "were set before anything was measured.\n\n"
         f"{_faults(found)}"
         f"\n## Two at once\n\n{_pairs(found)}"
         f"{_spoiled(found)}"

@@ -92,7 +92,7 @@ FAULTS = {
         "Check plug and cable; if they are well, the electrode has lost its fluid or its wire.",
     ),
     FaultKind.STUCK: (
-        "Its value does not change, as that of an intact channel would.",
+        "Its value stays the same; that of an intact channel varies.",
         "Unplug the finger and plug it in again; a line that repeats old words has to be reset.",
     ),
     FaultKind.ODD: (

@@ -34,7 +34,8 @@ HEAD = """# Faults: how they show, and how soon they are over
 How each fault of each emulated device is reported, and how soon the device works again afterwards.
 Made by `python docs/make_faults.py`: the gateway's own worker and pipeline read each device in
 software. Each device has each of its faults for {lasts} s, and outages also for {long} s. Every
-message is compared with the load or the counts of the device at that time.
+message is compared with the load or the counts of the device at that time. The emulators in
+`gateway/palpate_gateway/emulators` say what each fault is.
 
 *Shows as*: counters and errors that report it (those in `tests/gateway/fault_names.py`). *Wrong*:
 the number of messages with values that were not measured, or with a time before that of the message

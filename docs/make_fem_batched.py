@@ -36,6 +36,9 @@ SAME_M = 1e-6
 FOLDER = ROOT / "docs" / "results" / "fem-batched"
 PAGE = FOLDER.with_suffix(".md")
 
+CAMPAIGNS = ROOT / "docs" / "results" / "fem"
+"""Summaries of stores, by ``docs/make_fem_results.py STORE NAME``."""
+
 HEAD = """# Many indentations at once on a GPU
 
 How fast a GPU simulates presses, and how well it agrees with the solver on a core.
@@ -231,6 +234,33 @@ def swept(runs: list[dict[str, Any]]) -> str:
     )  # fmt: skip
 
 
+def campaign(told: str) -> str:
+    """The paper's trajectories, on a GPU and on cores: those that end differently."""
+    on_cores, on_gpu = (
+        {run["name"]: run for run in json.loads((CAMPAIGNS / f"{name}.json").read_text())}
+        for name in ("campaign", "campaign-gpu")
+    )
+    both = {name: (one, on_gpu[name]) for name, one in on_cores.items()}
+    same = [pair for pair in both.values() if pair[0]["outcome"] == pair[1]["outcome"]]
+    last = [abs(a["force_n"] / b["force_n"] - 1) for a, b in same if a["steps"] == b["steps"]]
+    rows = [
+        [name, *(f"{run['outcome']}, {run['travel_mm']:.2f} mm, {run['force_n']:.1f} N"
+                 for run in pair)]
+        for name, pair in both.items()
+        if pair not in same
+    ]  # fmt: skip
+    return "\n".join(
+        [
+            f"{told} {len(same)} of {len(both)} end equally on both. Of these,"
+            f" {sum(one <= 1e-5 for one in last)} of {len(last)} with equally many steps have a"
+            f" last force equal within 1e-5, {sum(one <= 1e-3 for one in last)} within 1e-3; the"
+            f" largest difference is {max(last):.1%}. The others, all close to the force at which"
+            " pinched skin snaps:\n",
+            markdown_table(["trajectory", "on cores", "on the GPU"], rows),
+        ]
+    )
+
+
 def main() -> None:
     """Write page and pictures."""
     report, meshes = read("slots.json"), read("meshes.json")
@@ -252,6 +282,7 @@ def main() -> None:
         f"## Agreement with the solver on a core\n\n`{report['agreement_command']}`, and the same"
         f" with `--tightened 10`. {report['agreement_told']}\n",
         agreement(report, FOLDER),
+        f"\n## All 450 trajectories\n\n{campaign(report['campaign_told'])}",
         "\n## A factorisation and a solve\n",
         f"All fronts are factorised: `{factor['command']}`. {factor['told']}\n",
         kernels(factor["runs"]),

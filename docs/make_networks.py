@@ -266,8 +266,8 @@ def page(values: dict[str, Any]) -> str:
         " size.\n\n"
         f"{bundles}\n"
         "## Networks of the study\n\n"
-        "Networks that estimate modes or read them, without the modes themselves; our film network"
-        " is the bundle `synthesis-twin`.\n\n"
+        "Networks whose output or input is coefficients of modes are counted without the modes. Our"
+        " synthesis network is `synthesis-twin`, above.\n\n"
         f"{networks}"
     )
 

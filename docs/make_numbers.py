@@ -95,10 +95,10 @@ def _fem() -> Iterator[Claim]:
     whole = {f"whole_{_name_of(run)}": f"{run['ms_a_trajectory']:.0f}" for run in slots}
     yield Claim(
         "README.md",
-        "{ms192} ms a press while 192 are under way (goals 100 and 30), {whole_ms192} ms over the"
-        " whole run, with its few last ones; two processes that share the GPU {ms192xm} and"
-        " {whole_ms192xm} ms, three with 384 presses at once {ms384xxm} and {whole_ms384xxm} ms."
-        " {ms16} ms while 16 are under way, {ms1} ms alone",
+        "a press takes {ms192} ms while all 192 slots are taken (goals 100 and 30), {whole_ms192}"
+        " ms over the whole run, at whose end slots are empty. Processes that share the GPU: two"
+        " {ms192xm} and {whole_ms192xm} ms, three with 384 slots {ms384xxm} and {whole_ms384xxm}"
+        " ms. With 16 slots {ms16} ms, alone {ms1} ms",
         figures | whole,
     )
     yield Claim(
@@ -150,7 +150,7 @@ def _real_force() -> Iterator[Claim]:
     for label, model, bold in (
         ("constant", "constant (training mean)", ""),
         ("linear fit", "linear fit", ""),
-        ("network (medians; mean of five seeds)", "MLP", "**"),
+        ("network (mean of five seeds)", "MLP", "**"),
         ("network trained on the *other* finger", "MLP", ""),
     ):
         held_out = "unseen" if "other" in label else "20 blocks"
@@ -281,8 +281,9 @@ def _chaos() -> Iterator[Claim]:
     }
     yield Claim(
         "README.md",
-        "the finite elements took up to {kill} and {hang} s, a station whose supervisors or"
-        " processes were all killed {all} s, and one whose supervisor hung {hung} s.",
+        "the finite-element service took up to {kill} s (killed) and {hang} s (hung), a station"
+        " whose supervisors or processes were all killed {all} s, and one whose supervisor hung"
+        " {hung} s.",
         figures,
     )
 
@@ -378,7 +379,7 @@ def _serving() -> Iterator[Claim]:
     slow = _read("serving/e2e-slow-host.json")
     ratios = {key: f"{slow[f'e2e.{key}_ratio']:.2f}" for key in ("p50", "p99")}
     yield Claim("README.md", "up to {p50} and {p99}. palpate warms", ratios)
-    yield Claim("README.md", "| {lost} of {frames} frames lost, p99 {load_p99} ms; fields", figures)
+    yield Claim("README.md", "| {lost} of {frames} frames lost, p99 {load_p99} ms (on", figures)
     yield Claim("README.md", "mesh at 100 Hz: {fields_lost} of {fields} lost", figures)
 
 

@@ -244,9 +244,10 @@ def main(data: Path | None) -> None:
             {
                 "bundle": "bundle", "finger": "finger", "rows": "rows",
                 "truth_median_n": "measured [N]", "estimate_median_n": "estimated [N]",
-                "wrong_share": "wrong", "flagged_of_wrong_share": "of these flagged",
-                "flagged_of_right_share": "flagged of the others",
-                "flagged_share": "flagged", "flagged_untouched_share": "flagged untouched",
+                "wrong_share": "wrong", "flagged_of_wrong_share": "wrong: flagged",
+                "flagged_of_right_share": "not wrong: flagged",
+                "flagged_share": "all rows: flagged",
+                "flagged_untouched_share": "untouched: flagged",
             },
         ),
         "",

@@ -349,18 +349,19 @@ leans by {lean_low:.0f} to {lean_high:.0f} degrees along the finger and by {side
 {side_high:.0f} across it, and moves up to {oblique:.0f} degrees off its normal, until {most:.0f} N.
 For each touch, each press gives one candidate: its state with the same size of force. How probable
 each is follows from the direction of the force, the given electrodes, and where the first touches
-were, given their force; place and warmth are then averaged over. All numbers:
+were, given their force; place and temperature are then averaged over. All numbers:
 [sensor-fit.json](sensor-fit.json).
 
-![Measured and told electrodes](sensor-fit.png)
+![Measured and predicted electrodes](sensor-fit.png)
 
 ## Later touches, after {headline}
 
 Explained: share of the variance of the tared counts over the later touches, all electrodes pooled,
 with the 5th and 95th percentile over draws of touches; a method that only knew the mean of these
 later touches would explain 0. In brackets: median absolute error [counts]. With five electrodes
-given (every fourth one, in four turns) the others are told; ridge regression gets the same inputs
-and learns from the same touches. With all given nothing is told: it says how near presses come.
+given (every fourth one, in four turns) the others are predicted; ridge regression gets the same
+inputs and learns from the same touches. With all given nothing is predicted: it shows how near
+presses come.
 
 """
 
@@ -374,7 +375,7 @@ Explained by ridge regression and by the fitted specimen, from the force and fiv
 GUESSES = """
 ## What was touched, and how finely the library covers it
 
-Explained by the specimen fitted to the rest and {headline} touches, on other libraries.
+Explained by the specimen fitted to the counts at rest and {headline} touches, on other libraries.
 
 """
 
@@ -386,35 +387,39 @@ PARAMETERS = """
 NOTES = """
 ## What it explains, and what it does not
 
-* **Touches matter, rest alone does not.** With force and five electrodes the specimen fitted to the
-  rest and 12 touches explains 0.24 and 0.63 of the other electrodes, the nominal one -0.58 and
-  0.22. The one fitted to the rest alone explains -0.93 and 0.33: on finger 1 it is worse than the
-  nominal one, although its counts at rest are right to 39 counts.
+* **Touches matter; counts at rest alone do not.** With force and five electrodes the specimen
+  fitted
+  to the counts at rest and 12 touches explains 0.24 and 0.63 of the other electrodes, the nominal
+  one -0.58 and
+  0.22. The one fitted to the counts at rest alone explains -0.93 and 0.33: on finger 1 it is worse
+  than the nominal one, although its counts at rest are right to 39 counts.
 * **Ridge regression is as good after 12 touches, and better after 8 and 20** (after 20: 0.68 and
   0.79 against 0.27 and 0.67). The fit is ahead after 4 (0.18 and 0.60 against -0.15 and 0.24): it
-  learns fast, and ends at what the model can do. It is a way to the twin of a sensor; who wants
-  the electrodes alone, and has 8 touches, takes the regression.
-* **Force alone tells little.** Nothing explains finger 1; on finger 2 the fit explains 0.23 and
+  learns fast, and ends at what the model can do. It gives a twin of the sensor. For the
+  electrodes alone, from 8 touches on, use the regression.
+* **Force alone predicts little.** Nothing explains finger 1; on finger 2 the fit explains 0.23 and
   ridge regression 0.21. The same force is at different places.
 * **Proximal electrodes.** On the real fingers E19 rises in each touch, by 20 to 160 counts, and E18
   in most; simulated ones fall when the pad is pressed near them. Their variance is small, so a
-  wrong mean gives -5 to -57. E15 is told badly, too.
+  wrong mean gives -5 to -57. E15 is predicted badly, too.
 * **E17**, under the pad, falls by up to 1,300 and 1,900 counts; in the touch of finger 2 that is
-  drawn the real one falls by more than twice what is told.
+  drawn the real one falls by more than twice what is predicted.
 * **Skin and fill are the twin's.** At which force the skin meets the core, and with what pressure,
   depends on both; a real finger with less fluid closes its film at a smaller force. Fitting them
-  needs a library for each; nothing here says what of the rest they would explain.
+  needs a library for each; nothing here says what they would explain of what is left.
 * **What was touched** hardly shows: with spheres of 14 mm instead of a plate about as much is
   explained. Fewer presses explain less on finger 1.
-* **Parameters are not measurements.** With touches the core sits half as far forward as the rest
-  alone says, the counts at rest are left with 58 instead of 36 to 39, and the clamp goes to its
+* **Parameters are not measurements.** With touches the core sits half as far forward as the counts
+  at
+  rest alone say, the counts at rest are left with 58 instead of 36 to 39, and the clamp goes to its
   bound. Film at infinite pressure, squeeze pressure and exponent stay at their priors: touches of 3
   to 7 N under an unknown place say nothing of them.
-* **Warmth.** The idle sensor beside rose by 160 counts in the three minutes of finger 1, by 70 in
-  those of finger 2: as much as E18 and E19 move. Each touch has its own warmth, but how much of it
-  the other parameters take up cannot be told.
+* **Temperature.** The idle sensor beside rose by 160 counts in the three minutes of finger 1, by
+  70 in those of finger 2: as much as E18 and E19 move. Each touch has its own temperature, but how
+  much of it the other parameters take up is not known.
 * **Not blind.** That a recording's places are learned from its first touches, the prior of the
-  warmth and the weight of the rest were chosen after a look at the later touches of both fingers.
+  temperature and the weight of the counts at rest were chosen after a look at the later touches of
+  both fingers.
   There is no third one to test them on. Nor was it tried blind whether the real force has the axes
   that it is read in, which rest on a correlation.
 """

@@ -23,8 +23,9 @@ PAGE = FOLDER.with_suffix(".md")
 HEAD = """# Serving: latency, load, faults, exchange of models, a long run
 
 Each table shows the output of the command above it. `make serving` runs all commands, and
-`python docs/make_serving.py` writes this page. The goals are those of the serving reference.
-Hostile files have [a page of their own](hostile-files.md), as have [faults of devices](faults.md).
+`python docs/make_serving.py` writes this page. The goals were set before anything was
+measured. Hostile files have [a page of their own](hostile-files.md), as have [faults of
+devices](faults.md).
 """
 
 
@@ -267,7 +268,8 @@ def _soak() -> str:
     text = (
         f"Slopes and losses leave out the first {result['warm_up_minutes']:.0f} of "
         f"{result['minutes']:.0f} minutes, in which caches fill; the messages are those of all. "
-        f"Goal: it is known that no process grows by {LIMIT_MB_PER_H:g} MB/h, and nothing is lost; "
+        f"Goal: each process is shown to grow by less than {LIMIT_MB_PER_H:g} MB/h, and nothing is "
+        "lost; "
         f"*undecided* is a slope that the run was too short to tell. Goal met: "
         f"{_yes(values['soak.goal_met'])}.\n\n{table}\n"
         f"{result['fingers']} fingers, {sum(received.values()):,} messages received, {lost} lost. "

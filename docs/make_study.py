@@ -36,7 +36,8 @@ same rows. The pages below have tables, pictures and the numbers behind them. Ea
 command:
 
 {pages}
-The tests of all units together in the first split of a task have five seeds, every other test has
+The tests of all specimens together in the first split of a task have five seeds, every other test
+has
 one.{missing} Time of each network per frame: [networks.md](networks.md). What was tried and failed:
 [training/LOG.md](../../training/LOG.md). How it is built: [ADR 22](../adr/0022-one-study.md).
 
@@ -45,8 +46,8 @@ one.{missing} Time of each network per frame: [networks.md](networks.md). What w
 * *Ours*: the mean of three networks.
 * *With gains*: the same, trained with random gains of the electrodes, which imitate fingers that
   were not seen.
-* *Floor*: the same network without gains, tested on rows whose neighbours it was trained on. It is
-  not a fair test; it shows what more presses could reach.
+* *Neighbouring rows*: the same network without gains, tested on rows whose neighbours it was
+  trained on. It is not a fair test; it shows what more presses could reach.
 * *Ratio*: our median error over that of the best of the paper's three networks in the same test,
   with its 95 % interval.
 
@@ -57,7 +58,7 @@ PAGES = (
         "[twin](study/twin/report.md)",
         "the twin: 450 indentations, three simulated BioTacs",
         "trajectories, executions, points, indenters; a BioTac (without calibration); "
-        "neighbouring rows (the floor, not a fair test)",
+        "neighbouring rows (not a fair test)",
     ),
     (
         "[real](study/real/report.md)",
@@ -95,8 +96,9 @@ TAIL = """
 
 **Too few presses**, for all tests on the twin. Every error falls with the number of trajectories
 that our networks are trained on, and none levels off ([picture](study/presses.png),
-`python docs/make_learning_curve.py`). The floors are below nearly all goals, so the goals are not
-prevented by noise, labels or networks. *Presses needed* extrapolates the slope of the last
+`python docs/make_learning_curve.py`). On neighbouring rows errors are below nearly all goals, so
+the goals
+are not prevented by noise, labels or networks. *Presses needed* extrapolates the slope of the last
 doubling; in fact slopes become flatter: with the presses of the section above, the force was
 {force_more} off. {hard} of the rows are above 8 N.
 
@@ -115,8 +117,8 @@ doubling; in fact slopes become flatter: with the presses of the section above, 
 * **Electrodes from the skin** are farthest from their goal: where the fluid film closes, its
   thickness depends on the pressure on the core, which can hardly be read from a displacement
   ([training/LOG.md](../../training/LOG.md)).
-* **Location below 2 N** includes the robot's registration error, one constant for each unit and
-  arm, which can only be learned on units that were seen.
+* **Location below 2 N** includes the robot's registration error, one constant for each specimen and
+  arm, which can only be learned on specimens that were seen.
 """
 
 
@@ -366,7 +368,7 @@ def page() -> str:
     """The whole page."""
     twin, real = read("twin"), read("real")
     table = markdown_table(
-        ("what", "goal at most", "ours", "with gains", "floor"), list(goals(twin, real))
+        ("what", "goal at most", "ours", "with gains", "neighbouring rows"), list(goals(twin, real))
     )
     caption = next(one["caption"] for one in twin["pictures"] if one["task"] == "")
     hard = caption.partition("above 8 N ")[2].partition(" of")[0]

@@ -289,8 +289,8 @@ def worse_pairs(results: list[dict[str, Any]]) -> str:
         worst = max(some, key=lambda one: one[key] / one["constant"][key])
         lines.append(
             f"* {shots} press{'es' * (shots != 1)}: of {len(some)} pairs {worse[0]} are worse than"
-            f" the constant, {worse[1]} than ridge regression; the worst beside the constant has"
-            f" {worst[key]:.2f} N for {worst['constant'][key]:.2f} N."
+            f" the constant, {worse[1]} than ridge regression; the worst pair has"
+            f" {worst[key]:.2f} N where the constant has {worst['constant'][key]:.2f} N."
         )
     return "\n".join(
         [

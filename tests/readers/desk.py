@@ -82,7 +82,7 @@ class Desk(Closing):
                 file.write_text(self._pasted(block.text), encoding="utf-8")
             elif block.language == "sh":
                 for line, reasons in block.left_out.items():
-                    left_out.extend(f"`{line}`: {mark} {why}" for mark, why in reasons)
+                    left_out.extend(f"`{line}`: {mark}: {why}" for mark, why in reasons)
                 there = marks.get("stand-in for") and (self._first / marks["stand-in for"]).exists()
                 skip = there or (again and "installs" in marks) or not block.run
                 printed = "" if skip else self.do(block)

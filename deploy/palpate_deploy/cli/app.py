@@ -163,7 +163,7 @@ def fleet(
     tls: TlsOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """All stations that are seen from a router, e.g. of a site; fails if anything is wrong."""
+    """All stations seen from a router, such as a site's; fails if anything is wrong."""
     from palpate_deploy.station.fleet import show_fleet
 
     raise typer.Exit(show_fleet(client_link(connect, tls), as_json=json_))
@@ -220,9 +220,7 @@ def calibrate(
     sensor: Annotated[str, typer.Argument(help="Name of the finger.")] = "finger",
     presses: Annotated[
         int,
-        typer.Option(
-            min=0, help="Presses to record: 6 or more; 0 = none, --others alone tell of the finger."
-        ),
+        typer.Option(min=0, help="Presses to record: 6 or more; 0 = none: only --others are used."),
     ] = 20,
     source: Annotated[
         Path | None,
@@ -451,7 +449,7 @@ def echo(
     )
 
 
-probe_app = group("What a cluster asks of one process: exit status 0 = yes, 1 = no.")
+probe_app = group("Health checks for a cluster: exit status 0 = yes, 1 = no.")
 
 
 @probe_app.command(epilog=example("palpate probe live"))

@@ -114,7 +114,12 @@ def _app(room: str) -> typer.Typer:
     " --points 1 --indenter sphere_medium --edge-mm 1.0",
 )
 def data_generate(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="Takes all; goes on if begun.")],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER", help="Where all is written; an interrupted run is continued."
+        ),
+    ],
     points: Annotated[
         int | None, typer.Option(min=1, help="Points for each indenter [default: 10].")
     ] = None,

@@ -153,7 +153,7 @@ def recover(
     """Write the whole messages of a cut-off or damaged record to NAME.recovered.mcap.
 
     A .part of which only the end is missing is removed then; one that is damaged otherwise becomes
-    NAME.mcap.damaged. A file of another name stays. What could not be read is told.
+    NAME.mcap.damaged. A file of another name stays. Prints what could not be read.
     """
     from palpate_deploy.diagnose.records import recover_record
 

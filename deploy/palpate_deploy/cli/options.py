@@ -27,7 +27,7 @@ WantedOption = Annotated[
         "--profile",
         "-p",
         metavar="NAME|FILE",
-        help="What should run; without it the station's own supervisor says so.",
+        help="Profile that lists what should run; default: what the station's supervisor lists.",
     ),
 ]
 ConnectOption = Annotated[

@@ -111,10 +111,10 @@ def plot_overview(
     for axes in panels[len(names) :]:
         axes.set_axis_off()
     bottom.suptitle("force in each trajectory; colour: how it ended", color=INK, fontsize=10)
-    complete = outcomes[IndentationOutcome.COMPLETE]
+    ended = {how: outcomes[how] for how in OUTCOME_COLOURS if outcomes[how]}
     figure.suptitle(
-        f"{title}\n{len(summaries)} trajectories, {complete} complete "
-        f"({complete / len(summaries):.1%})".strip(),
+        f"{title}\n{len(summaries)} trajectories: "
+        f"{', '.join(f'{count} {how.value}' for how, count in ended.items())}".strip(),
         color=INK,
         fontsize=12,
     )
