@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from palpate.messages import COUNTS_MAX
 from palpate_deploy.bench import alignment, codec, soak, swap
 from palpate_deploy.bench.e2e import Run
 from palpate_deploy.bench.e2e import _median as e2e_median
+from palpate_deploy.bench.fleet import _gap as fleet_gap
 from palpate_deploy.bench.fleet import _latency as fleet_latency
 from palpate_deploy.bench.harness import SourceGate, bench_counts, read_rows, write_rows
 from palpate_deploy.bench.results import Latency, append_history, finish, latency, rounds
@@ -73,6 +74,28 @@ def test_the_latency_of_a_phase_leaves_out_what_came_before(tmp_path: Path) -> N
     assert fleet_latency(tmp_path / "out.npz", 1)["received"] == 6
     found = fleet_latency(tmp_path / "out.npz", 1, since_ns=3000)
     assert (found["received"], found["lost"]) == (3, 0)
+
+
+@pytest.mark.parametrize(
+    ("arrived_ms", "gap_ms", "after"),
+    [
+        ([*range(10, 1010, 10), *range(1300, 6000, 10)], 300, 299),  # another takes over
+        (range(10, 1010, 10), 2000, 0),  # none does, and the fault's end does not help
+        ([*range(10, 1010, 10), *range(2990, 6000, 10)], 1990, 299),  # just before the fault's end
+        ([*range(10, 1010, 10), *range(3500, 6000, 10)], 2500, 250),  # only after it
+        (range(10, 700, 10), 2310, 0),  # silent before the fault already
+        ((), 2000, 0),
+    ],
+)
+def test_a_takeover_that_never_comes_is_the_longest_gap(
+    tmp_path: Path, arrived_ms: Sequence[int], gap_ms: int, after: int
+) -> None:
+    """Of a fault that lasts from 1.001 s to 3.001 s; the last estimate before it came at 1 s."""
+    rows = [(number, 0, 1_000_000 * at) for number, at in enumerate(arrived_ms)]
+    write_rows(tmp_path / "out.npz", ["a"] * len(rows), rows, dropped=0)
+    found = fleet_gap(tmp_path / "out.npz", 1_001_000_000, 3_001_000_000)
+    assert found["gap_s"] == pytest.approx(1e-3 * gap_ms, abs=2e-3)
+    assert found["estimates_after_heal"] == after
 
 
 def test_rounds_are_cut_at_pauses_and_warmed_up() -> None:
