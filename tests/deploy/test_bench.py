@@ -5,21 +5,30 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError
-from palpate.messages import COUNTS_MAX
-from palpate_deploy.bench import alignment, codec, soak, swap
+from palpate.messages import COUNTS_MAX, ServiceState, Status
+from palpate_deploy.bench import alignment, codec, load, soak, swap
 from palpate_deploy.bench.e2e import Run
 from palpate_deploy.bench.e2e import _median as e2e_median
 from palpate_deploy.bench.fleet import _gap as fleet_gap
 from palpate_deploy.bench.fleet import _latency as fleet_latency
 from palpate_deploy.bench.harness import SourceGate, bench_counts, read_rows, write_rows
-from palpate_deploy.bench.results import Latency, append_history, finish, latency, rounds
+from palpate_deploy.bench.results import (
+    Latency,
+    append_history,
+    finish,
+    latency,
+    progress_bar,
+    rounds,
+)
 from palpate_deploy.cli.app import app
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -50,11 +59,11 @@ def test_e2e_reports_both_sides_and_the_load(palpate: Palpate, bundle: str) -> N
     assert values["e2e.p50_ratio"] > 0
     assert values["e2e.bundle"].startswith("features-virtual:")
     for service, fingers in (("features", 3), ("field", 1)):
-        load = values[f"load.{service}"]
-        assert load["published"] >= 200 * fingers
-        assert load["lost"] == load["published"] - load["received"] >= 0
-        assert set(load["cores"]) == {"gateway", "service", "client", "router"}
-        assert load["stages_s"]["infer"] > 0
+        account = values[f"load.{service}"]
+        assert account["published"] >= 200 * fingers
+        assert account["lost"] == account["published"] - account["received"] >= 0
+        assert set(account["cores"]) == {"gateway", "service", "client", "router"}
+        assert account["stages_s"]["infer"] > 0
 
 
 def test_the_largest_latency_and_all_losses_of_several_runs_are_told() -> None:
@@ -170,6 +179,39 @@ def test_a_result_makes_its_folder(tmp_path: Path) -> None:
     out = tmp_path / "new" / "folder" / "x.json"
     finish("codec", {"a": 1}, lambda: None, as_json=False, save=False, out=out)
     assert json.loads(out.read_text(encoding="utf-8"))["a"] == 1
+
+
+def test_the_share_of_a_core_is_of_the_time_in_which_frames_are_sent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 10 s and 50 frames at 100 Hz: neither of the gateway's start nor of its rest."""
+    sending_s = 0.4
+    now_s, used_s, until_s = 0.0, 0.0, 0.0
+
+    def passes(seconds: float) -> None:
+        nonlocal now_s, used_s
+        used_s += sending_s * max(min(until_s - now_s, seconds), 0.0)
+        now_s += seconds
+
+    def starts(*_: object) -> None:
+        nonlocal used_s, until_s
+        used_s += 5.0
+        until_s = now_s + 10.5
+        passes(0.6)  # until it is known that it is ready
+
+    children = SimpleNamespace(folder=tmp_path, pid=lambda _: 1, stop_one=lambda _: 0)
+    finished = Status("gateway", "gateway", ServiceState.FINISHED, 1, 1, 1.0, "1")
+    write_rows(tmp_path / "client.npz", ["finger0"], [(1, 2, 3)], dropped=0)
+    monkeypatch.setattr(load, "time", SimpleNamespace(monotonic=lambda: now_s, sleep=passes))
+    monkeypatch.setattr(load, "FiniteRun", lambda _: nullcontext(children))
+    monkeypatch.setattr(load, "join", lambda *_, **__: nullcontext())
+    monkeypatch.setattr(load, "start_palpate", lambda *_, **__: None)
+    monkeypatch.setattr(load, "wait_ready", starts)
+    monkeypatch.setattr(load, "ask_status", lambda _: [finished])
+    monkeypatch.setattr(load, "_cpu_s", lambda _: {"gateway": used_s})
+    with progress_bar() as bar:
+        result = load.run_load("field", sensors=1, rate_hz=100, seconds=10, bundle="b", bar=bar)
+    assert result.cores["gateway"] == pytest.approx(sending_s, abs=1e-3)
 
 
 @pytest.mark.slow
