@@ -17,6 +17,7 @@ from palpate.errors import ConfigError
 from palpate.messages import COUNTS_MAX, ServiceState, Status
 from palpate_deploy.bench import alignment, codec, load, soak, swap
 from palpate_deploy.bench.e2e import Run
+from palpate_deploy.bench.e2e import _lost as e2e_lost
 from palpate_deploy.bench.e2e import _median as e2e_median
 from palpate_deploy.bench.fleet import _gap as fleet_gap
 from palpate_deploy.bench.fleet import _latency as fleet_latency
@@ -75,6 +76,26 @@ def test_the_largest_latency_and_all_losses_of_several_runs_are_told() -> None:
     assert told["p50_s"] == pytest.approx(0.1)
     assert told["max_s"] == pytest.approx(0.9)
     assert told["lost"] == 1
+
+
+@pytest.mark.parametrize(
+    ("without", "lost"),
+    [
+        ((), 0),
+        (range(110, 120), 10),
+        (range(100, 180), 80),  # it comes again in the next turn
+        (range(150, 400), 250),  # it does not, nor in the turn after that one
+        (range(398, 400), 0),  # on their way when the last turn ends
+    ],
+)
+def test_a_stream_that_ends_before_the_last_turn_has_lost_frames(
+    without: Sequence[int], lost: int
+) -> None:
+    """Four turns of a second at 100 Hz, with a second of the other side between them."""
+    turns = [(2 * n * 10**9, (2 * n + 1) * 10**9) for n in range(4)]
+    taken_ns = [begin + n * 10**7 for begin, _ in turns for n in range(100)]
+    rows = [(n, at, at + 10**6) for n, at in enumerate(taken_ns) if n not in without]
+    assert e2e_lost(np.array(rows, np.int64), turns) == pytest.approx(lost, abs=1)
 
 
 def test_the_latency_of_a_phase_leaves_out_what_came_before(tmp_path: Path) -> None:
