@@ -89,7 +89,9 @@ def results_page(values: Mapping[str, Any]) -> str:
     takeovers = [
         [
             FAULTS[one["fault"]],
-            "-" if one["gap_s"] is None else f"{one['gap_s']:.2f}",
+            f"{one['gap_s']:.2f}"
+            if one["estimates_after_heal"]
+            else f"none came, for {one['gap_s']:.2f}",
             str(one["twice"]),
             str(one["out_of_order"]),
         ]

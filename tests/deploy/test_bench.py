@@ -4,21 +4,32 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from palpate.errors import ConfigError
-from palpate.messages import COUNTS_MAX
-from palpate_deploy.bench import alignment, codec, soak, swap
+from palpate.messages import COUNTS_MAX, ServiceState, Status
+from palpate_deploy.bench import alignment, codec, load, soak, swap
 from palpate_deploy.bench.e2e import Run
+from palpate_deploy.bench.e2e import _lost as e2e_lost
 from palpate_deploy.bench.e2e import _median as e2e_median
+from palpate_deploy.bench.fleet import _gap as fleet_gap
 from palpate_deploy.bench.fleet import _latency as fleet_latency
 from palpate_deploy.bench.harness import SourceGate, bench_counts, read_rows, write_rows
-from palpate_deploy.bench.results import Latency, append_history, finish, latency, rounds
+from palpate_deploy.bench.results import (
+    Latency,
+    append_history,
+    finish,
+    latency,
+    progress_bar,
+    rounds,
+)
 from palpate_deploy.cli.app import app
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -49,11 +60,11 @@ def test_e2e_reports_both_sides_and_the_load(palpate: Palpate, bundle: str) -> N
     assert values["e2e.p50_ratio"] > 0
     assert values["e2e.bundle"].startswith("features-virtual:")
     for service, fingers in (("features", 3), ("field", 1)):
-        load = values[f"load.{service}"]
-        assert load["published"] >= 200 * fingers
-        assert load["lost"] == load["published"] - load["received"] >= 0
-        assert set(load["cores"]) == {"gateway", "service", "client", "router"}
-        assert load["stages_s"]["infer"] > 0
+        account = values[f"load.{service}"]
+        assert account["published"] >= 200 * fingers
+        assert account["lost"] == account["published"] - account["received"] >= 0
+        assert set(account["cores"]) == {"gateway", "service", "client", "router"}
+        assert account["stages_s"]["infer"] > 0
 
 
 def test_the_largest_latency_and_all_losses_of_several_runs_are_told() -> None:
@@ -67,12 +78,54 @@ def test_the_largest_latency_and_all_losses_of_several_runs_are_told() -> None:
     assert told["lost"] == 1
 
 
+@pytest.mark.parametrize(
+    ("without", "lost"),
+    [
+        ((), 0),
+        (range(110, 120), 10),
+        (range(100, 180), 80),  # it comes again in the next turn
+        (range(150, 400), 250),  # it does not, nor in the turn after that one
+        (range(398, 400), 0),  # on their way when the last turn ends
+    ],
+)
+def test_a_stream_that_ends_before_the_last_turn_has_lost_frames(
+    without: Sequence[int], lost: int
+) -> None:
+    """Four turns of a second at 100 Hz, with a second of the other side between them."""
+    turns = [(2 * n * 10**9, (2 * n + 1) * 10**9) for n in range(4)]
+    taken_ns = [begin + n * 10**7 for begin, _ in turns for n in range(100)]
+    rows = [(n, at, at + 10**6) for n, at in enumerate(taken_ns) if n not in without]
+    assert e2e_lost(np.array(rows, np.int64), turns) == pytest.approx(lost, abs=1)
+
+
 def test_the_latency_of_a_phase_leaves_out_what_came_before(tmp_path: Path) -> None:
     rows = [(number, 1000 * number, 1000 * number + 100 * (number % 3)) for number in range(6)]
     write_rows(tmp_path / "out.npz", ["a"] * 6, rows, dropped=0)
     assert fleet_latency(tmp_path / "out.npz", 1)["received"] == 6
     found = fleet_latency(tmp_path / "out.npz", 1, since_ns=3000)
     assert (found["received"], found["lost"]) == (3, 0)
+
+
+@pytest.mark.parametrize(
+    ("arrived_ms", "gap_ms", "after"),
+    [
+        ([*range(10, 1010, 10), *range(1300, 6000, 10)], 300, 299),  # another takes over
+        (range(10, 1010, 10), 2000, 0),  # none does, and the fault's end does not help
+        ([*range(10, 1010, 10), *range(2990, 6000, 10)], 1990, 299),  # just before the fault's end
+        ([*range(10, 1010, 10), *range(3500, 6000, 10)], 2500, 250),  # only after it
+        (range(10, 700, 10), 2310, 0),  # silent before the fault already
+        ((), 2000, 0),
+    ],
+)
+def test_a_takeover_that_never_comes_is_the_longest_gap(
+    tmp_path: Path, arrived_ms: Sequence[int], gap_ms: int, after: int
+) -> None:
+    """Of a fault that lasts from 1.001 s to 3.001 s; the last estimate before it came at 1 s."""
+    rows = [(number, 0, 1_000_000 * at) for number, at in enumerate(arrived_ms)]
+    write_rows(tmp_path / "out.npz", ["a"] * len(rows), rows, dropped=0)
+    found = fleet_gap(tmp_path / "out.npz", 1_001_000_000, 3_001_000_000)
+    assert found["gap_s"] == pytest.approx(1e-3 * gap_ms, abs=2e-3)
+    assert found["estimates_after_heal"] == after
 
 
 def test_rounds_are_cut_at_pauses_and_warmed_up() -> None:
@@ -147,6 +200,39 @@ def test_a_result_makes_its_folder(tmp_path: Path) -> None:
     out = tmp_path / "new" / "folder" / "x.json"
     finish("codec", {"a": 1}, lambda: None, as_json=False, save=False, out=out)
     assert json.loads(out.read_text(encoding="utf-8"))["a"] == 1
+
+
+def test_the_share_of_a_core_is_of_the_time_in_which_frames_are_sent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 10 s and 50 frames at 100 Hz: neither of the gateway's start nor of its rest."""
+    sending_s = 0.4
+    now_s, used_s, until_s = 0.0, 0.0, 0.0
+
+    def passes(seconds: float) -> None:
+        nonlocal now_s, used_s
+        used_s += sending_s * max(min(until_s - now_s, seconds), 0.0)
+        now_s += seconds
+
+    def starts(*_: object) -> None:
+        nonlocal used_s, until_s
+        used_s += 5.0
+        until_s = now_s + 10.5
+        passes(0.6)  # until it is known that it is ready
+
+    children = SimpleNamespace(folder=tmp_path, pid=lambda _: 1, stop_one=lambda _: 0)
+    finished = Status("gateway", "gateway", ServiceState.FINISHED, 1, 1, 1.0, "1")
+    write_rows(tmp_path / "client.npz", ["finger0"], [(1, 2, 3)], dropped=0)
+    monkeypatch.setattr(load, "time", SimpleNamespace(monotonic=lambda: now_s, sleep=passes))
+    monkeypatch.setattr(load, "FiniteRun", lambda _: nullcontext(children))
+    monkeypatch.setattr(load, "join", lambda *_, **__: nullcontext())
+    monkeypatch.setattr(load, "start_palpate", lambda *_, **__: None)
+    monkeypatch.setattr(load, "wait_ready", starts)
+    monkeypatch.setattr(load, "ask_status", lambda _: [finished])
+    monkeypatch.setattr(load, "_cpu_s", lambda _: {"gateway": used_s})
+    with progress_bar() as bar:
+        result = load.run_load("field", sensors=1, rate_hz=100, seconds=10, bundle="b", bar=bar)
+    assert result.cores["gateway"] == pytest.approx(sending_s, abs=1e-3)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from palpate_deploy.bench import census
+from palpate_deploy.station.processes import FiniteRun
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -41,6 +42,30 @@ def test_an_answer_is_complete_if_it_tells_every_state(
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: answer)
     call = census._call((), WANTED)
     assert (call.complete, call.ready) == (complete, ready)
+
+
+def test_an_answer_that_never_comes_is_not_complete(monkeypatch: pytest.MonkeyPatch) -> None:
+    def hangs(command: list[str], *, timeout: float, **_: object) -> None:
+        raise subprocess.TimeoutExpired(command, timeout)
+
+    monkeypatch.setattr(subprocess, "run", hangs)
+    call = census._call((), WANTED)
+    assert (call.complete, call.ready) == (False, False)
+    assert call.missing == ("features", "gateway", "router")
+    assert call.troubles == ("no answer within 60 s",)
+
+
+def test_only_complete_answers_say_that_all_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+    def call(complete: bool, ready: bool) -> census.StatusCall:
+        return census.StatusCall(complete, ready, 1.0)
+
+    start = call(True, True)  # of the station, before the cores are loaded
+    calls = iter([start, call(True, True), call(False, True), call(True, False)])
+    monkeypatch.setattr(census, "_call", lambda *_: next(calls))
+    monkeypatch.setattr(FiniteRun, "start_module", lambda *_: None)
+    result = census.measure_status(3, 0)
+    assert (result.complete, result.ready) == (2, 1)
+    assert len(result.others) == 2
 
 
 @pytest.mark.slow

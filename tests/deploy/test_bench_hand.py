@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,9 @@ Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 SENSORS = [*(f"finger{k}" for k in range(5)), "kms40", "bota"]
 
 
-def accounted(folder: Path, rows: list[list[int]], *, dropped: int = 0) -> HandResult:
+def accounted(
+    folder: Path, rows: list[list[int]], *, dropped: int = 0, end_ns: int = 12 * 10**6
+) -> HandResult:
     client, floor = folder / "client.npz", folder / "floor.npz"
     np.savez(
         client,
@@ -41,14 +44,18 @@ def accounted(folder: Path, rows: list[list[int]], *, dropped: int = 0) -> HandR
         )
         for count in (5, 3)
     ]
-    return account(
-        client, floor, 0, 10**9, GatewayUse(0.4, 0.5, 0, 0.0), {"finger0.lost_slots": 1}, looks
-    )
+    used = GatewayUse(0.4, 0.5, 0, 0.0)
+    return account(client, floor, 0, end_ns, used, {"finger0.lost_slots": 1}, looks)
 
 
 def whole_run() -> list[list[int]]:
     """Sensor, sequence, missed before, last sample, arrival [ns], invalid; 10 of each sensor."""
-    return [[n, k + 1, 0, 10**6 * k, 10**6 * k + 2_000_000, 0] for k in range(10) for n in range(7)]
+    return [row for k in range(10) for row in whole_row(k)]
+
+
+def whole_row(k: int) -> list[list[int]]:
+    """The frames of all sensors after ``k`` ms."""
+    return [[n, k + 1, 0, 10**6 * k, 10**6 * k + 2_000_000, 0] for n in range(7)]
 
 
 def test_a_whole_run_has_lost_nothing(tmp_path: Path) -> None:
@@ -74,6 +81,26 @@ def test_what_is_lost_is_counted(
 ) -> None:
     assert accounted(tmp_path, change(whole_run())).lost == lost
     assert accounted(tmp_path, whole_run(), dropped=2).lost == 2
+
+
+def test_a_sensor_that_stops_owes_its_frames_until_the_end(tmp_path: Path) -> None:
+    """At its rate, 1 kHz, where it has one."""
+    end_ns = 3 * 10**9
+    on = [row for n in range(3000) for row in whole_row(n)]
+    assert accounted(tmp_path, on, end_ns=end_ns).lost == 0
+    stopped = [row for row in on if row[0] != 2 or row[1] <= 1000]
+    assert accounted(tmp_path, stopped, end_ns=end_ns).lost == pytest.approx(2000, abs=5)
+    just_one = [row for row in on if row[0] != 5 or row[1] <= 1]
+    assert accounted(tmp_path, just_one, end_ns=end_ns).lost == 1
+
+
+def test_no_loss_is_one_that_the_gateway_does_not_count_either(tmp_path: Path) -> None:
+    """A sensor that falls silent and comes back leaves no hole in its numbers."""
+    result = accounted(tmp_path, whole_run())
+    assert not result.nothing_lost
+    assert replace(result, counters={}).nothing_lost
+    assert not replace(result, counters={"finger0.silences": 1}).nothing_lost
+    assert not replace(result, counters={}, lost=1).nothing_lost
 
 
 def test_it_runs(palpate: Palpate) -> None:

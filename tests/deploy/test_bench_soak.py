@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar, cast
@@ -17,6 +17,7 @@ import pytest
 
 from palpate.bus import Session
 from palpate.errors import StreamTimeout
+from palpate_deploy.bench import soak
 from palpate_deploy.bench.growth import (
     BINS,
     Growth,
@@ -130,34 +131,69 @@ def test_a_run_that_is_too_short_to_tell_does_not_meet_the_goal() -> None:
     assert not short.met
 
 
-def test_frames_without_features_are_lost() -> None:
-    class Stream:
-        counters: ClassVar[dict[str, int]] = {}
+class NumberedStream:
+    """Messages of one finger, with such sequence numbers."""
 
-        def __init__(self, sequences: list[int]) -> None:
-            self._left = sequences
+    counters: ClassVar[dict[str, int]] = {}
 
-        def next(self, timeout_s: float) -> SimpleNamespace:
-            if not self._left:
-                raise StreamTimeout("no more", remedy="none")
-            source = SimpleNamespace(sequence=self._left.pop(0))
-            return SimpleNamespace(sensor="finger", message=SimpleNamespace(source=source))
+    def __init__(self, sequences: Iterable[int]) -> None:
+        self._left = list(sequences)
 
-    streams = {name: Stream([5, 6, 9, 10]) for name in ("electrodes", "features", "field")}
-    client = _Client(
-        cast(
-            Session,
-            SimpleNamespace(subscriber=lambda topic, **_: streams.get(topic.name, Stream([]))),
-        )
-    )
+    def next(self, timeout_s: float) -> SimpleNamespace:
+        if not self._left:
+            raise StreamTimeout("no more", remedy="none")
+        stamp = SimpleNamespace(sequence=self._left.pop(0))
+        return SimpleNamespace(sensor="finger", message=SimpleNamespace(source=stamp, stamp=stamp))
+
+
+def taken(**sequences: Iterable[int]) -> _Client:
+    """A client that has taken these messages of each topic."""
+    streams = {name: NumberedStream(numbers) for name, numbers in sequences.items()}
+    count = sum(len(stream._left) for stream in streams.values())
+    subscriber = lambda topic, **_: streams.get(topic.name, NumberedStream([]))  # noqa: E731
+    client = _Client(cast(Session, SimpleNamespace(subscriber=subscriber)))
     deadline = time.monotonic() + PATIENCE_S
-    while sum(client.received.values()) < 12 and time.monotonic() < deadline:
+    while sum(client.received.values()) < count and time.monotonic() < deadline:
         time.sleep(0.01)
     client.close()
-    assert sum(client.received.values()) == 12
-    assert {name: count for name, count in client.lost().items() if count} == {
-        "client frames without features": 2
-    }
+    assert sum(client.received.values()) == count
+    return client
+
+
+def lost(client: _Client) -> dict[str, int]:
+    return {name: count for name, count in client.lost().items() if count}
+
+
+def test_frames_without_features_are_lost() -> None:
+    client = taken(electrodes=range(5, 11), features=[5, 6, 9, 10], field=[5, 10])
+    assert lost(client) == {"client frames without features": 2}
+
+
+@pytest.mark.parametrize(
+    ("features", "without"),
+    [
+        (range(5, 1000), 0),  # one is on its way
+        (range(5, 201), 800),  # they end
+        ([*range(5, 101), *range(151, 201)], 850),
+        ([], 996),  # they never come
+    ],
+)
+def test_frames_after_the_last_features_are_lost(features: Iterable[int], without: int) -> None:
+    client = taken(electrodes=range(5, 1001), features=features)
+    assert lost(client).get("client frames without features", 0) == without
+
+
+def test_frames_that_end_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By their rate: 1000 in 10 s."""
+    now_s = 10.0
+    monkeypatch.setattr(soak, "time", SimpleNamespace(monotonic=lambda: now_s))
+    client = taken(electrodes=range(1001), features=range(1001))
+    client.begun_s = 0.0
+    assert lost(client) == {}
+    now_s = 12.0
+    assert lost(client) == {}
+    now_s = 40.0
+    assert lost(client) == {"client electrodes ended": 3000}
 
 
 def test_too_few_samples_are_no_answer() -> None:

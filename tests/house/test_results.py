@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import runpy
 import subprocess
 import sys
@@ -38,6 +39,14 @@ def test_the_plan_of_a_fleet_ends_at_twice_what_was_measured() -> None:
     assert table.count("| more than 32 |") == len(page["PHASES"])
     table = page["plan_table"]({"scale": [fleet(1, 0.0), fleet(16, 0.3)]})
     assert table.count("| 25 |") == len(page["PHASES"])
+
+
+def test_a_takeover_that_never_came_is_told() -> None:
+    page = program("make_fleet.py")
+    values = json.loads(page["FILE"].read_text(encoding="utf-8"))
+    assert "none came" not in page["results_page"](values)
+    values["takeovers"][0] |= {"gap_s": 8.2, "estimates_after_heal": 0}
+    assert "| none came, for 8.20 |" in page["results_page"](values)
 
 
 def test_a_bound_is_not_rounded_down() -> None:

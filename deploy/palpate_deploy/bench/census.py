@@ -115,7 +115,7 @@ def measure_status(count: int, burners: int) -> StatusResult:
     return StatusResult(
         count,
         sum(call.complete for call in calls),
-        sum(call.ready for call in calls),
+        sum(call.complete and call.ready for call in calls),
         len(wanted),
         burners,
         float(np.median(seconds)),
@@ -127,12 +127,17 @@ def measure_status(count: int, burners: int) -> StatusResult:
 def _call(where: tuple[str, ...], wanted: frozenset[str]) -> StatusCall:
     command = [sys.executable, "-m", "palpate_deploy", "status", "--json", *where]
     began_s = time.monotonic()
-    done = subprocess.run(command, capture_output=True, text=True, timeout=_CALL_S, check=False)
+    all_missing = tuple(sorted(wanted))
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_CALL_S, check=False)
+    except subprocess.TimeoutExpired:
+        late = f"no answer within {_CALL_S:g} s"
+        return StatusCall(False, False, time.monotonic() - began_s, all_missing, (late,))
     seconds = time.monotonic() - began_s
     try:
         told: dict[str, Any] = json.loads(done.stdout)
     except ValueError:  # the command failed, and said so on stderr
-        return StatusCall(False, False, seconds, tuple(sorted(wanted)), (done.stderr.strip(),))
+        return StatusCall(False, False, seconds, all_missing, (done.stderr.strip(),))
     # The router has no state of its own: it lives if the command reached it.
     known = {one["service"] for one in told["processes"] if "state" in one}
     if told["router"]:

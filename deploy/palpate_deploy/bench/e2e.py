@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -147,13 +148,16 @@ def measure_latency(*, seconds: float, rounds: int, bundle: str, model: Path, ba
             gate.set(False)
             time.sleep(SETTLE_S)
         begun_ns = time.monotonic_ns()
+        turns: list[list[tuple[int, int]]] = [[], []]
         task = bar.add_task("latency, interleaved", total=2 * rounds)
         for turn in range(rounds):
             # The order alternates, so that no side always follows the other.
             for side in (turn % 2, 1 - turn % 2):
+                opened_ns = time.monotonic_ns()
                 opened[side].set(True)
                 time.sleep(seconds)
                 opened[side].set(False)
+                turns[side].append((opened_ns, time.monotonic_ns()))
                 time.sleep(SETTLE_S)
                 children.check(names)
                 bar.advance(task)
@@ -164,10 +168,8 @@ def measure_latency(*, seconds: float, rounds: int, bundle: str, model: Path, ba
             children.stop_one(name)
         results: list[Latency] = []
         stages_s: dict[str, float] = {}
-        for out in outs:
+        for out, own in zip(outs, turns, strict=True):
             _, rows, _ = read_rows(out)
-            # Frames before the first estimate had no tare and do not count as lost.
-            lost = int(rows[-1, 0] - rows[0, 0] + 1 - len(rows)) if len(rows) else -1
             measured = rows[(rows[:, 1] >= begun_ns) & (rows[:, 1] < ended_ns)]
             if not len(measured):
                 raise LinkError(
@@ -175,8 +177,20 @@ def measure_latency(*, seconds: float, rounds: int, bundle: str, model: Path, ba
                     remedy=f"see the logs in {children.folder / 'logs'}",
                 )
             stages_s |= stage_medians(measured)  # the floor notes none
-            results.append(latency(measured, warm_up=_WARM_UP, lost=lost))
+            results.append(latency(measured, warm_up=_WARM_UP, lost=_lost(rows, own)))
     return Run(results[_PALPATE], results[_FLOOR], stages_s)
+
+
+def _lost(rows: npt.NDArray[np.int64], turns: list[tuple[int, int]]) -> int:
+    """Frames of a side without an estimate: holes, and what it owes after its last one.
+
+    ``turns`` are begins and ends of the time in which frames were sent [ns], host monotonic clock.
+    Frames before the first estimate had no tare and do not count.
+    """
+    holes = int(rows[-1, 0] - rows[0, 0] + 1 - len(rows))
+    silent_ns = sum(max(end - max(begin, int(rows[-1, 2])), 0) for begin, end in turns)
+    # Less may be frames on their way.
+    return holes + (round(silent_ns * 1e-9 * RATE_HZ) if silent_ns >= SETTLE_S * 1e9 else 0)
 
 
 def _start_floor(children: FiniteRun, model: Path, out: Path, gates: Path, core: str) -> None:

@@ -76,11 +76,18 @@ class EstimateAccount:
 
 
 def account_of(received: npt.NDArray[np.int64]) -> EstimateAccount:
-    """Account for estimates: tick, stamp and arrival [ns] of each, shape ``(N, 3)``."""
+    """Account for estimates: tick, stamp and arrival [ns] of each, shape ``(N, 3)``.
+
+    Raises:
+        LinkError: There are not two, between which frames could be lost.
+    """
     rows = received[received[:, 0] < FORGED_TICK]
     forged = len(received) - len(rows)
     if len(rows) < 2:
-        return EstimateAccount(len(rows), 0, forged, 0, 0.0, 0.0, 0.0)
+        raise LinkError(
+            f"{len(rows)} estimates of {SENSOR!r} in a part of a trial",
+            remedy="see the logs in the folder of the run",
+        )
     steps = np.diff(rows[:, 0])
     ages_s = (rows[:, 2] - rows[:, 1]) * 1e-9
     return EstimateAccount(
@@ -115,18 +122,27 @@ class EstimateObserver:
             self._rows.append((source.device_tick, source.monotonic_ns, got.received_monotonic_ns))
 
     def mark(self) -> int:
-        """The present place in the account; wait for the next estimate first."""
+        """Wait for the next estimate: its place in the account, where a part of a trial begins.
+
+        Raises:
+            LinkError: None comes in time.
+        """
         self.wait_for_next()
-        return len(self._rows)
+        return len(self._rows) - 1
 
     def wait_for_next(self, *, taken_after_ns: int = 0) -> float:
         """Wait for an estimate that is not received yet, of a frame taken after a time; how long.
+
+        Frames that the device did not take do not count, see ``FORGED_TICK``.
 
         Raises:
             LinkError: None comes in time.
         """
         began_s, seen = time.monotonic(), len(self._rows)
-        while not any(row[1] > taken_after_ns for row in self._rows[seen:]):
+        while not any(
+            tick < FORGED_TICK and taken_ns > taken_after_ns
+            for tick, taken_ns, _ in self._rows[seen:]
+        ):
             if time.monotonic() - began_s > _PATIENCE_S:
                 raise LinkError(
                     f"no estimate of {SENSOR!r} for {_PATIENCE_S:g} s",
@@ -136,7 +152,14 @@ class EstimateObserver:
         return time.monotonic() - began_s
 
     def account(self, since: int) -> EstimateAccount:
-        """Account for the estimates since a mark."""
+        """Account for the estimates since a mark, up to the first of a frame that is taken now.
+
+        It is waited for: where estimates stop, the end of the part would hide the hole.
+
+        Raises:
+            LinkError: None comes in time.
+        """
+        self.wait_for_next(taken_after_ns=time.monotonic_ns())
         return account_of(np.array(self._rows[since:], np.int64).reshape(-1, 3))
 
     def close(self) -> None:

@@ -95,7 +95,6 @@ def router_killed(seconds: float) -> tuple[bool, Figures]:
                 return {one.service for one in session.alive() if one.ready} >= set(names)
 
             found_s = back_s + seconds_until(all_there)
-        station.observer.wait_for_next()
         station.check(*names)
         same = before == {name: station.pid(name) for name in names}
         account = station.observer.account(mark)

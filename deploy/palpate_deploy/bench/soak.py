@@ -53,6 +53,12 @@ KEEP_BYTES = 256 << 20
 
 _START_S = 120.0
 _ATTEMPTS = 5
+_ENDED_S = 5.0
+"""Frames that have not come for so long have ended [s]."""
+
+_ON_THE_WAY = 100
+"""So many frames may wait for their features."""
+
 _TOPICS = (ELECTRODES, FEATURES, FIELD, SYNTHESIS)
 _LOSSES = ("lost", "overflow", "dropped", "disk_failures", "view_failed", "removal_failures")
 
@@ -110,7 +116,11 @@ class _Client:
 
     def __init__(self, session: Session) -> None:
         self.received: Counter[str] = Counter()
-        self.without_features = 0
+        self.begun_s = time.monotonic()
+        self._holes = 0
+        self._first: dict[str, int] = {}
+        self._newest: dict[str, tuple[int, float]] = {}  # sequence and arrival [s]
+        self._answered: dict[str, int] = {}
         self._stop = threading.Event()
         self._streams = {
             topic.name: session.subscriber(topic, delivery=Delivery.QUEUE) for topic in _TOPICS
@@ -123,19 +133,23 @@ class _Client:
             thread.start()
 
     def _take(self, name: str, stream: Subscriber[Any]) -> None:
-        last: dict[str, int] = {}
         while not self._stop.is_set():
             try:
                 received = stream.next(0.5)
             except StreamTimeout:
                 continue
-            self.received[name] += 1
-            if name == FEATURES.name:
+            sensor = received.sensor
+            if name == ELECTRODES.name:
+                sequence = received.message.stamp.sequence
+                self._first.setdefault(sensor, sequence)
+                self._newest[sensor] = sequence, time.monotonic()
+            elif name == FEATURES.name:
                 # A tare leaves a hole, which the bus does not count; here it comes at the start.
                 sequence = received.message.source.sequence
-                hole = sequence - last.get(received.sensor, sequence - 1) - 1
-                self.without_features += max(hole, 0)
-                last[received.sensor] = sequence
+                hole = sequence - self._answered.get(sensor, sequence - 1) - 1
+                self._holes += max(hole, 0)
+                self._answered[sensor] = sequence
+            self.received[name] += 1
 
     def lost(self) -> Counter[str]:
         """What did not arrive, by topic and cause; fields and syntheses are of some frames only."""
@@ -145,7 +159,17 @@ class _Client:
             lost[f"client {name} overflow"] = counters.get("overflow", 0)
             if name == ELECTRODES.name:
                 lost[f"client {name} lost_on_bus"] = counters.get("lost_on_bus", 0)
-        lost["client frames without features"] = self.without_features
+        # A stream that has ended leaves no hole.
+        without, ended = self._holes, 0
+        for sensor, (newest, arrived_s) in self._newest.copy().items():  # the threads go on
+            first = self._first[sensor]
+            behind = newest - self._answered.get(sensor, first - 1)
+            without += behind if behind > _ON_THE_WAY else 0
+            if (silent_s := time.monotonic() - arrived_s) > _ENDED_S:
+                rate_hz = (newest - first) / max(arrived_s - self.begun_s, SAMPLE_S)
+                ended += max(round(silent_s * rate_hz), 1)
+        lost["client frames without features"] = without
+        lost["client electrodes ended"] = ended
         return lost
 
     def close(self) -> None:

@@ -94,6 +94,17 @@ def test_short_streams_are_refused() -> None:
         drift(np.zeros((150, 19)), RATE_HZ)
 
 
+@pytest.mark.parametrize("rate_hz", [0.01, 0.2, 2.0, 2.2])
+def test_a_rate_that_shows_no_noise_is_refused(rate_hz: float) -> None:
+    with pytest.raises(DatasetError, match=f"{rate_hz:g} Hz show nothing faster than 1 Hz"):
+        spectrum(np.random.default_rng(1).normal(size=(1000, 19)), rate_hz)
+
+
+def test_a_slow_rate_that_shows_some_noise_is_not_refused() -> None:
+    found = spectrum(np.random.default_rng(1).normal(size=(1000, 19)), 2.5)
+    assert (found.noise_sd() > 0).all()
+
+
 def test_idle_twin_is_read(tmp_path: Path) -> None:
     path = tmp_path / "idle.npz"
     counts = np.full((6000, 19), 3000, np.uint16)

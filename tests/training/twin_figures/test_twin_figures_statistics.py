@@ -143,6 +143,8 @@ def test_fence_stops_at_a_value_and_leaves_the_far_one() -> None:
     assert (box.low, box.high) == (0.0, 6.9)
     with pytest.raises(DatasetError, match="0 values"):
         box_of(np.empty(0))
+    with pytest.raises(DatasetError, match="4 values, 3 of them not finite"):
+        box_of(np.array([1.0, np.inf, -np.inf, np.nan]))
 
 
 @given(st.floats(-15e-3, -1e-6), st.floats(-1.7, 1.7))

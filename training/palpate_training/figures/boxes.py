@@ -66,11 +66,12 @@ def box_of(values: Floats) -> BoxStatistics:
     Fences are 1.5 IQR long, rounded down to the nearest value; what lies beyond is not shown.
 
     Raises:
-        DatasetError: There is no value, or one is not a number.
+        DatasetError: There is no value, or one is not finite.
     """
-    if not len(values) or not np.isfinite(values).all():
+    wrong = len(values) - int(np.isfinite(values).sum())
+    if not len(values) or wrong:
         raise DatasetError(
-            f"a box of {len(values)} values, {int(np.isnan(values).sum())} of them not a number",
+            f"a box of {len(values)} values, {wrong} of them not finite",
             remedy="check the data set: each unit needs rows, all of them finite",
         )
     exact = np.asarray(values, np.float64)

@@ -173,9 +173,16 @@ def spectrum(counts: Floats, rate_hz: float) -> NoiseSpectrum:
     into the noise.
 
     Raises:
-        DatasetError: The stream is shorter than two windows.
+        DatasetError: The stream is shorter than two windows, or its rate too low for noise.
     """
     length = round(_SEGMENT_S * rate_hz)
+    # The fastest but one that such windows resolve: the last one is left out below.
+    if (length // 2 - 1) * rate_hz < NOISE_ABOVE_HZ * length:
+        raise DatasetError(
+            f"untouched electrodes at {rate_hz:g} Hz show nothing faster than {NOISE_ABOVE_HZ:g} "
+            "Hz, which is called noise",
+            remedy="record them at the sensor's own rate",
+        )
     if len(counts) < 2 * length:
         raise DatasetError(
             f"{len(counts)} samples at {rate_hz:g} Hz are too few for windows of {_SEGMENT_S:g} s",
