@@ -82,6 +82,20 @@ def test_the_same_failure_again_is_no_news(clock: Time) -> None:
     assert health.changed.is_set()
 
 
+def test_an_error_that_does_not_degrade_is_shown_when_the_trouble_is_over(clock: Time) -> None:
+    health = Health("features", "features")
+    health.fail(SILENT)
+    health.fail(DeviceTimeout("'thumb' is of another type", remedy="name it"), degraded=False)
+    shown = health.status()
+    assert shown.last_error is not None
+    assert (shown.message, shown.last_error.message) == (SILENT.problem, SILENT.problem)
+    health.set_state(ServiceState.READY, "serves")
+    clock.now_s += health_module.RECOVERY_S + 1e-6
+    shown = health.status()
+    assert shown.last_error is not None
+    assert (shown.message, shown.last_error.message) == ("serves", "'thumb' is of another type")
+
+
 def test_stopping_waits_for_nothing(clock: Time) -> None:
     health = Health("gateway", "gateway")
     health.fail(SILENT)
