@@ -394,3 +394,6 @@ class HealthReporter(Closing):
             self._publisher.put(self._status())
         except PalpateError as error:
             _log.warning("last status not published: %s", error)
+        except Exception:
+            # Whatever closes this has more to close.
+            _log.exception("last status not published: defect")

@@ -286,6 +286,22 @@ def test_a_defect_in_one_report_does_not_end_the_reports(
     assert "changed size" in caplog.text
 
 
+def test_a_defect_in_the_last_report_does_not_hinder_the_end(
+    link: LinkConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    ends = threading.Event()
+
+    def refresh() -> None:
+        if ends.is_set():
+            raise RuntimeError("dictionary changed size during iteration")
+
+    with Session.open(link) as session:
+        reporter = HealthReporter(session, Health("features", "features"), refresh=refresh)
+        ends.set()
+        reporter.close()
+    assert "last status not published" in caplog.text
+
+
 def test_gauges_that_a_source_has_no_more_are_gone() -> None:
     health = Health("gateway", "gateway")
     health.gauge("wall_error_s", 0.1)
