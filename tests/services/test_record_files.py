@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -452,7 +453,7 @@ def test_whenever_it_is_killed_a_recorder_loses_less_than_promised(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """At 100 Hz, and in the silence after the last message (services/README.md)."""
-    clock, sent, copies = HandClock(), 0, tmp_path / "copies"
+    clock, sequences, copies = HandClock(), count(1), tmp_path / "copies"
     monkeypatch.setattr(record_writer, "time", clock)
     monkeypatch.setattr(writer_module, "time", clock)
 
@@ -468,7 +469,7 @@ def test_whenever_it_is_killed_a_recorder_loses_less_than_promised(
 
     with open_files() as (files, _):
         for burst in (100, 35, 50, 65):
-            for sent in range(sent + 1, sent + burst + 1):
+            for sent in islice(sequences, burst):
                 clock.now_s += 0.01
                 files.write(sample(sent))
                 files.tick()
