@@ -128,8 +128,10 @@ class CommandGuard:
         self._token = token
         self._station, self._service, self._instance = station, service, instance
         # Numbers of past commands are forgotten with the process: older commands do not pass. By
-        # the monotonic clock: the wall clock may be set back by hours after a start.
+        # the monotonic clock: the wall clock may be set back by hours after a start. And by the
+        # wall clock while it is set back by little: what was given before would be new again.
         self._began_ns = time.monotonic_ns()
+        self._began_wall_ns = time.time_ns()
         self._used: dict[bytes, int] = {}
         self._lock = threading.Lock()
 
@@ -152,6 +154,8 @@ class CommandGuard:
         now_ns = time.time_ns()
         age_s = (now_ns - command.wall_ns) * 1e-9
         began_ns = now_ns - (time.monotonic_ns() - self._began_ns)
+        if self._began_wall_ns - now_ns <= CLOCK_S * 1e9:
+            began_ns = max(began_ns, self._began_wall_ns)
         if abs(age_s) > CLOCK_S or command.wall_ns < began_ns:
             _deny(
                 f"the command was given {age_s:.0f} s ago by this host's clock, it holds for "

@@ -74,6 +74,7 @@ class Health:
         self._state = ServiceState.STARTING
         self._message = self._state_message = ""
         self._last_error: ErrorReply | None = None
+        self._state_error: ErrorReply | None = None  # which made the state DEGRADED
         self._recovery: tuple[float, str] | None = None  # since when all is well, and the message
         self._sensors: tuple[str, ...] = ()
         self._sensor_states: dict[str, SensorStatus] = {}
@@ -171,14 +172,17 @@ class Health:
                 _log.warning("gauge %s = %s measures nothing and is left out", name, value)
 
     def fail(self, error: PalpateError, *, degraded: bool = True) -> None:
-        """Remember the last error; by default the state becomes DEGRADED."""
+        """Remember the last error; by default the state becomes DEGRADED.
+
+        One that does not degrade is not shown before the state is no longer DEGRADED by another.
+        """
         told = error_reply(error)
         with self._lock:
             new = told != self._last_error
             self._last_error = told
             self._message = error.problem
             if degraded:
-                self._state_message = error.problem
+                self._state_error, self._state_message = told, error.problem
                 new = new or self._state is not ServiceState.DEGRADED
                 self._state, self._recovery = ServiceState.DEGRADED, None
         if new:
@@ -199,7 +203,7 @@ class Health:
                 self._wake_by(since_s + RECOVERY_S)
                 return
             different = state is not self._state
-            self._state, self._recovery = state, None
+            self._state, self._recovery, self._state_error = state, None, None
             self._message = self._state_message = message
         if different:
             self.tell()
@@ -223,6 +227,7 @@ class Health:
                 since_s, message = self._recovery
                 if now_s >= since_s + RECOVERY_S:
                     self._state, self._recovery = ServiceState.READY, None
+                    self._state_error = None
                     self._message = self._state_message = message
                     self.tell()
                 else:
@@ -298,6 +303,7 @@ class Health:
         monotonic_ns, wall_ns = clock.now()
         usage = self._usage.gauges()
         with self._lock:
+            degraded = self._state is ServiceState.DEGRADED
             return Status(
                 self.service,
                 self.instance,
@@ -309,8 +315,8 @@ class Health:
                 dict(self._counters),
                 {**usage, **self._gauges},
                 self._sensors,
-                self._message,
-                self._last_error,
+                self._state_message if degraded else self._message,
+                self._state_error or self._last_error,
                 tuple(self._sensor_states.values()),
                 self._processes,
                 self._models,
@@ -388,3 +394,6 @@ class HealthReporter(Closing):
             self._publisher.put(self._status())
         except PalpateError as error:
             _log.warning("last status not published: %s", error)
+        except Exception:
+            # Whatever closes this has more to close.
+            _log.exception("last status not published: defect")

@@ -304,12 +304,25 @@ def test_what_is_given_beside_a_profile_holds(
     assert asked[1] == (DEFAULT_CONNECT, DEFAULT_STATION)
 
 
-def test_doctor_takes_the_folder_of_a_bag(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("driver", "grade"),
+    [("ros_bag", "ok"), ("text_log", "fail"), ("record", "fail"), ("pose_file", "fail")],
+)
+def test_doctor_takes_a_folder_for_a_bag_only(tmp_path: Path, driver: str, grade: str) -> None:
     """A bag of ROS 2 is one."""
-    for path, grade in ((tmp_path, "ok"), (tmp_path / "gone", "fail")):
-        sensor = {"name": "finger", "driver": "ros_bag", "options": {"path": str(path)}}
+    there = {"position_m": [0.0, 0.0, 0.0], "orientation_wxyz": [1.0, 0.0, 0.0, 0.0]}
+    options: dict[str, object] = {}
+    if driver == "pose_file":
+        options = {"indenter": "sphere_7mm", "base_sensor": there, "flange_indenter": there}
+    for path, expected, says in (
+        (tmp_path, grade, "is a folder"),
+        (tmp_path / "gone", "fail", "does not exist"),
+    ):
+        sensor = {"name": "finger", "driver": driver, "options": {**options, "path": str(path)}}
         profile = changed(load_profile("virtual"), gateway={"sensors": [sensor]})
-        assert doctor._sensors(profile)[0] == grade
+        found = doctor._sensors(profile)
+        assert found[0] == expected
+        assert expected == "ok" or says in found[1]
 
 
 def test_a_tare_over_many_frames_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:

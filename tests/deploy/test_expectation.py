@@ -27,6 +27,7 @@ from palpate_deploy.station.host import (
     write_profile,
     write_run_file,
 )
+from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import parse_profile
 from palpate_deploy.station.status import show_status
 from palpate_deploy.station.troubles import (
@@ -112,6 +113,14 @@ def test_folders_of_ended_runs_go_although_a_process_has_their_id() -> None:
     done = subprocess.run([sys.executable, "-c", made], capture_output=True, text=True, check=True)
     assert Path(done.stdout.strip()).is_dir()
     assert Path(done.stdout.strip()) not in running_folders()
+
+
+def test_a_run_that_was_stopped_is_over_though_its_process_goes_on() -> None:
+    with FiniteRun("a") as run:
+        assert run.folder in running_folders()
+    assert run.folder.exists()
+    assert run.folder not in running_folders()
+    run.stop()
 
 
 def test_a_damaged_folder_is_passed_over() -> None:

@@ -17,7 +17,7 @@ from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.process import state_folder
 from palpate_deploy.station import lifetime, supervision
-from palpate_deploy.station.host import private_profile
+from palpate_deploy.station.host import private_profile, running_folders
 from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import load_profile
 
@@ -128,6 +128,8 @@ def test_one_late_answer_does_not_shorten_the_end(
         finally:
             os.kill(supervisor._process.pid, signal.SIGCONT)
         wait_until(answers, PATIENCE_S, "it answers again")
+        assert supervisor.folder in running_folders()
+    assert supervisor.folder not in running_folders()
     assert ends_s == [2 * supervision.STOP_WAIT_S + 5]
 
 

@@ -61,3 +61,26 @@ def test_a_refused_tare_is_the_message_until_one_succeeds() -> None:
     health.fail(DeviceLost("the line is gone", remedy="plug it in"))
     report.tare_refused(None)
     assert health.status().message == "the line is gone"
+
+
+def test_a_refused_tare_hides_no_other_trouble() -> None:
+    """Attempts follow closely, and each tells other numbers."""
+    health = Health("gateway", "a")
+    finger, force = SensorReport("thumb", health), SensorReport("ft", health)
+    health.set_state(ServiceState.READY, "all sensors deliver")
+    finger.tare_refused(DeviceError("PAC varies by 21 counts", remedy="let go"))
+    force.delivers(None, zero_lost=True)
+
+    def told() -> tuple[str, str]:
+        now = health.status()
+        assert now.state is ServiceState.DEGRADED
+        assert now.last_error is not None
+        return now.message, now.last_error.remedy
+
+    problem, remedy = told()
+    assert "zero" in problem
+    assert remedy.endswith("palpate tare ft")
+    finger.tare_refused(DeviceError("PAC varies by 23 counts", remedy="let go"))
+    assert told() == (problem, remedy)
+    finger.tare_refused(None)
+    assert told() == (problem, remedy)

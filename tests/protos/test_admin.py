@@ -108,6 +108,27 @@ def test_a_clock_that_is_set_back_after_the_start_refuses_no_new_command(
     assert "ago" in denied(guard, before)
 
 
+def test_a_clock_that_is_set_back_a_little_after_a_start_makes_no_old_command_new(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    true_ns = time.time_ns
+
+    def set_back(step_s: float) -> None:
+        monkeypatch.setattr(time, "time_ns", lambda: true_ns() - round(step_s * 1e9))
+
+    first = CommandGuard(TOKEN, station="lab", service="features", instance="features")
+    time.sleep(0.001)
+    request = signed(command(), TOKEN)
+    assert first.admit(request).bundle == "x:1"
+    time.sleep(0.001)
+    again = CommandGuard(TOKEN, station="lab", service="features", instance="features")
+    for step_s in (0.0, 2.0, 20.0):
+        set_back(step_s)
+        assert "ago" in denied(again, request)
+    set_back(-0.1)  # the clock has caught up
+    assert again.admit(signed(command(), TOKEN)).bundle == "x:1"
+
+
 def test_numbers_are_kept_while_they_could_pass_and_no_more(
     guard: CommandGuard, monkeypatch: pytest.MonkeyPatch
 ) -> None:

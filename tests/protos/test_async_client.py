@@ -251,11 +251,13 @@ def test_calls_that_take_all_threads_are_cancelled() -> None:
     assert all(cancelled), "none ends by its own time"
 
 
-def test_a_client_whose_calls_take_all_threads_can_be_closed(link: LinkConfig) -> None:
+def test_a_client_whose_calls_take_all_threads_opens_streams_and_can_be_closed(
+    link: LinkConfig, finger: Finger
+) -> None:
     goes_on = threading.Event()
 
     async def scene() -> None:
-        async with AsyncClient(link.connect[0], station="test") as robot:
+        async with AsyncClient(link.connect[0]) as robot:
             begun: list[None] = []
 
             def call() -> None:
@@ -265,10 +267,14 @@ def test_a_client_whose_calls_take_all_threads_can_be_closed(link: LinkConfig) -
             calls = [asyncio.create_task(robot.in_thread(call)) for _ in range(_AT_ONCE)]
             while len(begun) < _AT_ONCE:
                 await asyncio.sleep(0.01)
+            await anext(robot.stream_features("finger", max_age_s=LIVE_S))
             await robot.aclose()
             assert not any(one.done() for one in calls), "none had to end before"
+            calls[0].cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await calls[0]
             goes_on.set()
-            await asyncio.gather(*calls)
+            await asyncio.gather(*calls[1:])
 
     asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
 

@@ -82,6 +82,20 @@ def test_the_same_failure_again_is_no_news(clock: Time) -> None:
     assert health.changed.is_set()
 
 
+def test_an_error_that_does_not_degrade_is_shown_when_the_trouble_is_over(clock: Time) -> None:
+    health = Health("features", "features")
+    health.fail(SILENT)
+    health.fail(DeviceTimeout("'thumb' is of another type", remedy="name it"), degraded=False)
+    shown = health.status()
+    assert shown.last_error is not None
+    assert (shown.message, shown.last_error.message) == (SILENT.problem, SILENT.problem)
+    health.set_state(ServiceState.READY, "serves")
+    clock.now_s += health_module.RECOVERY_S + 1e-6
+    shown = health.status()
+    assert shown.last_error is not None
+    assert (shown.message, shown.last_error.message) == ("serves", "'thumb' is of another type")
+
+
 def test_stopping_waits_for_nothing(clock: Time) -> None:
     health = Health("gateway", "gateway")
     health.fail(SILENT)
@@ -270,6 +284,22 @@ def test_a_defect_in_one_report_does_not_end_the_reports(
         while reports < 3:
             states.next(PATIENCE_S)
     assert "changed size" in caplog.text
+
+
+def test_a_defect_in_the_last_report_does_not_hinder_the_end(
+    link: LinkConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    ends = threading.Event()
+
+    def refresh() -> None:
+        if ends.is_set():
+            raise RuntimeError("dictionary changed size during iteration")
+
+    with Session.open(link) as session:
+        reporter = HealthReporter(session, Health("features", "features"), refresh=refresh)
+        ends.set()
+        reporter.close()
+    assert "last status not published" in caplog.text
 
 
 def test_gauges_that_a_source_has_no_more_are_gone() -> None:

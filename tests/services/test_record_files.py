@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from palpate.bus.topics import ELECTRODES, TARE, sensor_key
 from palpate.codec import ELECTRODE_FRAME
 from palpate.errors import ErrorCode, RecordingError
 from palpate.files import record_writer
-from palpate.files.record import check_readable, read_record, summarise
+from palpate.files.record import check_readable, read_record, recover, summarise
 from palpate.files.record_writer import RecordWriter
 from palpate.health import Health
 from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
@@ -430,6 +431,54 @@ def test_a_disk_that_refuses_the_tare_of_a_frame_is_survived(
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         assert health.state is ServiceState.DEGRADED
     assert health.counters["lost_disk_full"] == 2, "the frame and its tare"
+
+
+class HandClock:
+    """The module ``time``, with a monotonic clock that goes on by hand."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(time, name)
+
+
+def test_whenever_it_is_killed_a_recorder_loses_less_than_promised(
+    open_files: Any,
+    sample: Callable[[int], TapSample],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At 100 Hz, and in the silence after the last message (services/README.md)."""
+    clock, sequences, copies = HandClock(), count(1), tmp_path / "copies"
+    monkeypatch.setattr(record_writer, "time", clock)
+    monkeypatch.setattr(writer_module, "time", clock)
+
+    def kept() -> int:
+        """Messages in a copy of what has reached the operating system."""
+        copies.mkdir()
+        (part,) = (tmp_path / "runs").glob("*.part")
+        try:
+            recovery = recover(Path(shutil.copy(part, copies)))
+            return sum(1 for _ in read_record(recovery.path))
+        finally:
+            shutil.rmtree(copies)
+
+    with open_files() as (files, _):
+        for burst in (100, 35, 50, 65):
+            for sent in islice(sequences, burst):
+                clock.now_s += 0.01
+                files.write(sample(sent))
+                files.tick()
+                if sent >= 30 and sent % 3 == 0:
+                    assert sent - kept() < 30
+            for _ in range(29):
+                clock.now_s += 0.01
+                files.tick(idle=True)
+            assert kept() == sent
 
 
 @pytest.mark.parametrize("size", [0, 1, 7])

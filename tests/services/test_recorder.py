@@ -276,7 +276,9 @@ def test_kill_9_loses_a_moment_only(
     kept = [i.sequence for i in read_record(record.path) if i.address.topic == "electrodes"]
     assert kept == list(range(kept[0], kept[-1] + 1))
     assert kept[0] <= 2  # the first may pass before the subscription has reached the publisher
-    assert kept[-1] >= 400 - 300  # 3 s at 100 Hz: a busy host may flush ten times later
+    # 3 s at 100 Hz: a busy host may flush ten times later. What is promised is tested by a clock
+    # that goes on by hand, in test_record_files.
+    assert kept[-1] >= 400 - 300
     sys.stdout.write(f"lost {400 - kept[-1]} frames\n")
 
 

@@ -171,6 +171,42 @@ def test_a_record_of_today_stays_after_the_clock_was_put_right(
     assert left(tmp_path) == []
 
 
+class SleepingHost:
+    """Clocks of a host that may be suspended, by hand."""
+
+    CLOCK_MONOTONIC, CLOCK_BOOTTIME = time.CLOCK_MONOTONIC, time.CLOCK_BOOTTIME
+
+    def __init__(self) -> None:
+        self.awake_s, self.slept_s, self.began_s = 1000.0, 0.0, time.time()
+
+    def monotonic(self) -> float:
+        return self.awake_s
+
+    def clock_gettime(self, clock: int) -> float:
+        return self.awake_s + (self.slept_s if clock == time.CLOCK_BOOTTIME else 0.0)
+
+    def time(self) -> float:
+        return self.began_s + self.awake_s - 1000.0 + self.slept_s
+
+
+def test_the_days_of_a_suspended_host_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    host = SleepingHost()
+    monkeypatch.setattr(retention, "time", host)
+    kept, _ = keeper(tmp_path, keep_s=2 * DAY_S)
+    kept.apply()
+    record(tmp_path, name_of(1))
+    host.awake_s += retention.STEADY_S
+    kept.apply()
+    assert left(tmp_path) == [name_of(1)]
+    host.slept_s += 10 * DAY_S
+    for _ in range(2):
+        host.awake_s += retention.STEADY_S
+        kept.apply()
+    assert left(tmp_path) == []
+
+
 def test_a_recorder_without_retention_marks_nothing_and_removes_nothing(tmp_path: Path) -> None:
     record(tmp_path, name_of(1), age_s=99 * DAY_S)
     kept, _ = keeper(tmp_path)

@@ -49,6 +49,8 @@ _PACKAGES = (
     ("pymetis", "pymetis", "fem"),
     ("threadpoolctl", "threadpoolctl", "fem"),
 )
+# Not ros_bag: a bag of ROS 2 is a folder.
+_DRIVERS_OF_A_FILE = ("text_log", "record", "pose_file")
 _YEAR_MIN = 2024
 _ROUTER_WAIT_S = 1.0
 _SLEEP_S = 0.01
@@ -135,9 +137,12 @@ def _sensors(profile: Profile) -> Found:
     names = []
     for sensor in profile.gateway.sensors:
         make_device(sensor.driver, sensor.options, where=f"options of sensor {sensor.name!r}")
-        path = sensor.options.get("path")
-        if path is not None and not Path(str(path)).exists():  # a bag may be a folder
-            return "fail", f"sensor {sensor.name!r}: {path} does not exist", "set its path"
+        if (path := sensor.options.get("path")) is not None:
+            if not Path(str(path)).exists():
+                return "fail", f"sensor {sensor.name!r}: {path} does not exist", "set its path"
+            if sensor.driver in _DRIVERS_OF_A_FILE and Path(str(path)).is_dir():
+                fix = "set its path to a file in it"
+                return "fail", f"sensor {sensor.name!r}: {path} is a folder", fix
         names.append(f"{sensor.name} ({sensor.driver})")
     found = ", ".join(names)
     if strange := _unserved(profile):

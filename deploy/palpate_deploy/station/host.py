@@ -117,8 +117,14 @@ RUN_LOCK = "running"
 """File in the folder of a run that its process holds locked: another one may have its id later."""
 
 
+_locks: dict[Path, int] = {}
+"""Descriptors of the locks that this process holds, by folder."""
+
+
 def new_run_folder(name: str) -> Path:
     """Make an empty folder for a run, and remove those of the oldest runs.
+
+    The run lasts until ``end_run``, or the end of this process.
 
     Raises:
         ConfigError: The folder cannot be made.
@@ -128,8 +134,10 @@ def new_run_folder(name: str) -> Path:
     folder = runs / f"{stamp}-{name}-{os.getpid()}"
     try:
         (folder / "logs").mkdir(parents=True, mode=0o700)
-        # Never closed: the kernel gives the lock back when this process ends, however it does.
-        fcntl.flock(os.open(folder / RUN_LOCK, os.O_CREAT | os.O_WRONLY, 0o600), fcntl.LOCK_EX)
+        # The kernel gives the lock back when this process ends, however it does.
+        lock = os.open(folder / RUN_LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        _locks[folder] = lock
     except OSError as error:
         raise ConfigError(
             f"run folder {folder} cannot be made: {error.strerror or error}",
@@ -141,8 +149,14 @@ def new_run_folder(name: str) -> Path:
     return folder
 
 
+def end_run(folder: Path) -> None:
+    """Say that a run of this process has ended; may be repeated. Its folder stays."""
+    if (lock := _locks.pop(folder, None)) is not None:
+        os.close(lock)
+
+
 def running_folders() -> list[Path]:
-    """Folders of the runs whose process still runs, oldest first."""
+    """Folders of the runs that have not ended, oldest first."""
     runs = state_folder() / "runs"
     try:
         return sorted(path for path in runs.iterdir() if path.is_dir() and _in_use(path))
@@ -157,7 +171,7 @@ def run_pid(folder: Path) -> int:
 
 
 def _in_use(folder: Path) -> bool:
-    """Whether the process that made a run's folder still runs."""
+    """Whether the run of a folder has not ended, and the process that made it still runs."""
     try:
         with open(folder / RUN_LOCK, "rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

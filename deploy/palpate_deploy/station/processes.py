@@ -19,7 +19,7 @@ from palpate.config import LinkConfig, Role
 from palpate.errors import ConfigError, PalpateError
 from palpate.process import check_installed, stop_on_signals
 from palpate_deploy.station import logs
-from palpate_deploy.station.host import new_run_folder, write_profile
+from palpate_deploy.station.host import end_run, new_run_folder, write_profile
 from palpate_deploy.station.lifetime import end_with_parent, start_child, stop_child
 from palpate_deploy.station.profile import Profile, Service
 
@@ -289,6 +289,7 @@ class FiniteRun:
         """Stop every process in reverse order of starting, each after the one before has ended."""
         for name in reversed(self._running):
             self.stop_one(name)
+        end_run(self.folder)
 
     def stop_one(self, name: str) -> int:
         """Stop a process; its exit status."""

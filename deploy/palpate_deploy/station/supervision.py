@@ -24,7 +24,13 @@ from supervisor.states import getProcessStateDescription
 
 from palpate.errors import PalpateError
 from palpate.heartbeat import FILE_VARIABLE, read_pulse
-from palpate_deploy.station.host import check_free, new_run_folder, write_profile, write_run_file
+from palpate_deploy.station.host import (
+    check_free,
+    end_run,
+    new_run_folder,
+    write_profile,
+    write_run_file,
+)
 from palpate_deploy.station.lifetime import start_child, stop_child
 from palpate_deploy.station.logs import DEVICE
 from palpate_deploy.station.processes import START_ORDER, command_line
@@ -159,6 +165,7 @@ class Supervisor:
         stop_child(self._process, orderly_s)
         self._end_leftovers()
         shutil.rmtree(self._socket_folder, ignore_errors=True)
+        end_run(self.folder)
 
     def _end_leftovers(self) -> None:
         """End what a supervisord that was killed left behind.

@@ -213,7 +213,7 @@ def _wrong(
         if supervised.state == RUNNING:
             return (
                 "runs and cannot be reached",
-                "one that hangs is replaced within 10 s: ask again; if it stays, see its log",
+                "one that hangs is replaced, most within 10 s: ask again; if it stays, see its log",
             )
         times = f", started again {supervised.restarts} times" if supervised.restarts else ""
         return (

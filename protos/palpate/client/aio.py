@@ -13,6 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar
@@ -95,9 +96,9 @@ class AsyncStream(Generic[M]):
         def watch() -> Watch[M]:
             return Watch(self._make(), self._offer, self._offer)
 
-        self._watch = await self._client.in_thread(watch)
+        self._watch = await self._client.promptly(watch)
         if self._closed:  # meanwhile
-            await self._client.in_thread(self._watch.close)
+            await self._client.promptly(self._watch.close)
 
     def _offer(self, item: M | PalpateError) -> None:
         with self._lock:
@@ -122,7 +123,7 @@ class AsyncStream(Generic[M]):
         self._closed = True
         self._arrived.set()
         if self._watch is not None:
-            await self._client.in_thread(self._watch.close)
+            await self._client.promptly(self._watch.close)
         elif self._opening is not None:
             await asyncio.wait({self._opening})  # it closes what it opens
 
@@ -199,7 +200,7 @@ class AsyncClient:
         self._client: Client | None = None
         self._streams: list[AsyncStream[Any]] = []
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="palpate call")
-        # Of its own, for cancelling and closing: calls that wait may have all of the others.
+        # Of its own, for what waits for no answer: calls that do may have all of the others.
         self._canceller = ThreadPoolExecutor(1, thread_name_prefix="palpate cancel")
 
     features = _awaitable(Client.features)
@@ -254,8 +255,14 @@ class AsyncClient:
         try:
             return await future
         except asyncio.CancelledError:
-            self._canceller.submit(cancellation.cancel)
+            with suppress(RuntimeError):  # closed: the question ended with the client
+                self._canceller.submit(cancellation.cancel)
             raise
+
+    async def promptly(self, work: Callable[[], R]) -> R:
+        """The result of ``work``, which waits for no answer, also while calls take all threads."""
+        check_process()
+        return await asyncio.get_running_loop().run_in_executor(self._canceller, work)
 
     def keep(self, stream: AsyncStream[Any]) -> None:
         """Close this stream with the client."""
@@ -270,7 +277,7 @@ class AsyncClient:
             await stream.aclose()
         client, self._client = self._client, None
         if client is not None:
-            await asyncio.get_running_loop().run_in_executor(self._canceller, client.close)
+            await self.promptly(client.close)
         self._end_threads()
 
     def _end_threads(self) -> None:

@@ -35,6 +35,8 @@ STEADY_S = 600.0
 that has just started may be years off."""
 
 _JUMP_S = 60.0
+# Goes on while the host is suspended, as the wall clock does.
+_STEADY = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 _STAMP = r"-\d{8}T\d{6}\.\d{3}Z"
 _ENDING = r"(?:\.recovered)?\.mcap(?:\.part|\.damaged)?"
 
@@ -62,7 +64,7 @@ class Retention:
         self._name = re.compile(f"(?P<stem>{re.escape(station)}{_STAMP}){_ENDING}")
         self._health = health
         self._mine: dict[tuple[str, int], bool] = {}  # by name and inode: files never change
-        # Those closed since the first look, and when (monotonic, s): the wall clock by which their
+        # Those closed since the first look, and when (steady, s): the wall clock by which their
         # files were written may have been put right since then.
         self._closed_s: dict[tuple[str, int], float] = {}
         self._looked = False
@@ -105,7 +107,7 @@ class Retention:
 
     @staticmethod
     def _read_clocks() -> tuple[float, float]:
-        return time.monotonic(), time.time()
+        return time.clock_gettime(_STEADY), time.time()
 
     def _records(self) -> list[OldRecord]:
         """Closed records that this station's recorder may remove, oldest first."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
+import sys
 import time
 import zipfile
 from collections.abc import Callable
@@ -34,6 +37,7 @@ from palpate_training.learning.splits import Fold, RowSplit
 from palpate_training.systems.fields import FIELD_SYSTEMS
 from palpate_training.systems.statistical import STATISTICAL
 
+PATIENCE_S = 60.0
 ROWS = RowSplit(*(np.arange(start, start + 4) for start in (0, 4, 8, 12)))
 FOLD = Fold("trajectory", "all units", "", ROWS)
 
@@ -179,6 +183,53 @@ def test_on_ctrl_c_nothing_begins_and_what_is_under_way_is_kept(tmp_path: Path) 
     assert {seed for seed, path in paths.items() if path.exists()} == begun
     assert len(begun) <= 2
     assert all(read_cell(paths[seed]).arrays["ignored"] for seed in begun)
+
+
+@dataclass(frozen=True)
+class EndlessTask(SlowTask):
+    """Its first training is done at once, the others never."""
+
+    def fit_and_test(self, system: Any, rows: RowSplit, seed: int) -> dict[str, Any]:
+        (self.begun / str(seed)).touch()
+        time.sleep(3600 if seed else 0)
+        return {}
+
+
+ENDLESS = """
+import sys
+from pathlib import Path
+from tests.training.evaluation.test_cells import FOLD, EndlessTask, cells_of, make_cells
+task = EndlessTask(begun=Path(sys.argv[1]))
+each = list(cells_of(task, [FOLD], range(8)))
+make_cells([task], each, task.begun, workers=2, on_cell=lambda *_: None)
+"""
+
+
+def test_the_second_ctrl_c_leaves_what_is_under_way(root: Path, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    with log.open("wb") as stderr:
+        program = subprocess.Popen(
+            [sys.executable, "-c", ENDLESS, str(tmp_path)],
+            cwd=root, stderr=stderr, start_new_session=True,
+        )  # fmt: skip
+
+    def interrupt_when(true: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while not true():
+            assert time.monotonic() < deadline, log.read_text()
+            time.sleep(0.05)
+        os.killpg(program.pid, signal.SIGINT)
+
+    try:
+        interrupt_when(lambda: all((tmp_path / str(seed)).exists() for seed in (1, 2)))
+        interrupt_when(lambda: "waits for 2 trainings" in log.read_text())
+        assert program.wait(PATIENCE_S) == -signal.SIGINT
+    finally:
+        program.kill()  # its workers end with it
+        program.wait()
+    task = EndlessTask(begun=tmp_path)
+    kept = [cell_path(tmp_path, task, cell).exists() for cell in cells_of(task, [FOLD], range(8))]
+    assert kept == [True] + 7 * [False]
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:

@@ -216,7 +216,7 @@ def make_cells(
     Networks are trained on ``device``, as torch calls it; with ``cuda`` the processes take turns
     among the GPUs that there are. ``on_cell`` is told each cell, and whether it had to be made.
     A training that fails is logged, and the others go on. Whatever ends this early, Ctrl-C too,
-    those under way are waited for and kept.
+    those under way in processes are waited for and kept; Ctrl-C while they are ends them.
 
     Raises:
         DatasetError: The disk refuses.
@@ -262,6 +262,7 @@ def _make_in_processes(
     device: str,
     finish: Callable[[Cell, Callable[[], bytes]], None],
 ) -> None:
+    others = set(multiprocessing.active_children())
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(
         min(workers, max(1, len(cells))),
@@ -289,10 +290,20 @@ def _make_in_processes(
             "a worker process died", remedy="give it more memory, or use fewer workers"
         ) from error
     finally:
-        pool.shutdown(cancel_futures=True)
-        for future, cell in running.items():
-            if not future.cancelled() and future.exception() is None:
-                finish(cell, future.result)
+        try:
+            if count := sum(not future.done() for future in running):
+                _log.warning("waits for %d trainings to keep them; Ctrl-C ends them at once", count)
+            wait(running)
+        except KeyboardInterrupt:
+            # The pool and the interpreter's exit would wait for them, too.
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.kill()
+            raise
+        finally:
+            pool.shutdown()
+            for future, cell in running.items():
+                if future.exception() is None:
+                    finish(cell, future.result)
 
 
 _tasks: dict[str, Task] = {}
