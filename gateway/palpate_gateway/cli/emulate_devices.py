@@ -398,14 +398,15 @@ def _can_failures() -> Failures:
 
 def _checked_link(link: Path | None) -> str:
     """Path for the name of the line; only the name of an earlier line is replaced."""
+    from palpate_gateway.emulators.lines import reserve
+
     if link is None:
         return ""
-    if link.exists() and not link.is_symlink():
-        raise ConfigError(f"--link {link}: a file of this name is there", remedy="name another")
     if not link.parent.is_dir():
         raise ConfigError(
             f"--link {link}: there is no folder {link.parent}", remedy="make it, or name another"
         )
+    reserve(link).close()  # what is wrong with it is told before the twin is computed
     return str(link.absolute())
 
 
