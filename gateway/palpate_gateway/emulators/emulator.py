@@ -60,12 +60,19 @@ class Emulator(ABC):
     def inject(self, fault: str, duration_s: float = 0.0) -> None:
         """Start a fault for a duration [s]; 0 = once, at the next sample.
 
+        One that acts already goes on until the later of both ends.
+
         Raises:
             ValueError: It has no such fault.
         """
         self._check(fault)
         with self._lock:
-            self._until[fault] = time.monotonic() + duration_s if duration_s > 0.0 else 0.0
+            now_s = time.monotonic()
+            until_s = now_s + duration_s if duration_s > 0.0 else 0.0
+            acts_until_s = self._until.get(fault, 0.0)
+            if acts_until_s > now_s:
+                until_s = max(until_s, acts_until_s)
+            self._until[fault] = until_s
 
     def faulty(self, fault: str) -> bool:
         """Whether a fault acts now; a call that returns True uses up a fault injected for once."""
