@@ -45,7 +45,7 @@ class Emulator(ABC):
             raise ValueError(f"rate_hz {rate_hz} is not in 0..100000")
         self.rate_hz = rate_hz
         self.sent = 0
-        """Samples that were sent complete and correct."""
+        """Samples that went out whole, each once; what a fault made them say does not matter."""
         self._until: dict[str, float] = {}
         self._held_s: float | None = None
         self._lock = threading.Lock()

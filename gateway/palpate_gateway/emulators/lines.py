@@ -169,17 +169,23 @@ class SerialLine:
                 data = os.read(self._device, _AT_ONCE)
         return data if self._same_speed() else b""
 
-    def write(self, data: bytes | bytearray) -> None:
-        """Send to the host, if the line is plugged; noise if the host's speed is another one."""
+    def write(self, data: bytes | bytearray) -> bool:
+        """Send to the host, if the line is plugged; noise if the host's speed is another one.
+
+        Returns:
+            Whether the host can read all of it.
+        """
         if not self.plugged:
-            return
-        if not self._same_speed():
+            return False
+        heard = self._same_speed()
+        if not heard:
             data = self._noise.randbytes(len(data))
         try:
             taken = os.write(self._device, data)
         except OSError:
             taken = 0
         self.overrun += len(data) - taken
+        return heard and taken == len(data)
 
     def _same_speed(self) -> bool:
         set_by_host = _SPEEDS.get(termios.tcgetattr(self._host)[5])

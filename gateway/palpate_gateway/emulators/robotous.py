@@ -181,8 +181,7 @@ class RobotousEmulator(Emulator):
             if fault in self.faults and self.faulty(fault):
                 self._spoil(fault, data)
                 return
-        self._send(data)
-        self.sent += 1
+        self.sent += self._send(data)
         if self.faulty("repeated"):
             self._send(data)
 
@@ -191,8 +190,8 @@ class RobotousEmulator(Emulator):
         """D1..D8 of the received requests."""
 
     @abstractmethod
-    def _send(self, data: bytes) -> None:
-        """Send D1..D16."""
+    def _send(self, data: bytes) -> bool:
+        """Send D1..D16; whether they went out whole."""
 
     @abstractmethod
     def _spoil(self, fault: str, data: bytes) -> None:
@@ -236,8 +235,8 @@ class RobotousSerialEmulator(SerialEmulator, RobotousEmulator):
             self._came = self._came[length:]
         return out
 
-    def _send(self, data: bytes) -> None:
-        self._line.write(b"\x55" + data + bytes([sum(data) % 256]) + b"\xaa")
+    def _send(self, data: bytes) -> bool:
+        return self._line.write(b"\x55" + data + bytes([sum(data) % 256]) + b"\xaa")
 
     def _spoil(self, fault: str, data: bytes) -> None:
         if fault == "junk":
@@ -304,9 +303,10 @@ class RobotousCanEmulator(RobotousEmulator):
             message = self._bus.recv(0.0)
         return out
 
-    def _send(self, data: bytes) -> None:
+    def _send(self, data: bytes) -> bool:
         self._put(self.ids[1], data[:8])
         self._put(self.ids[2], data[8:])
+        return True
 
     def _spoil(self, fault: str, data: bytes) -> None:
         if fault == "junk":

@@ -176,6 +176,8 @@ class RosEmulator(RoutedEmulator):
         payload = self._message(self.held(t), time_ns)
         if self.faulty("cut"):
             payload = payload[:-8]
+        else:
+            self.sent += 1
         attachment = struct.pack("<qqB", self._sequence, time.time_ns(), 16) + self._gid
         if self._held is None and self.faulty("late"):
             self._held = (payload, attachment)
@@ -190,7 +192,6 @@ class RosEmulator(RoutedEmulator):
     def _tell(self, payload: bytes, attachment: bytes) -> None:
         if self._publisher is not None:
             self._publisher.put(payload, attachment)
-            self.sent += 1
 
 
 class RosHandEmulator(RosEmulator):

@@ -1,16 +1,26 @@
-"""Names of emulated serial lines: whose they are, and what is never replaced or removed."""
+"""Emulated serial lines: whose a name is, what is never replaced or removed, and what is heard."""
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from palpate.errors import ConfigError
+from palpate_gateway.emulators.biotac_bridge import BiotacBridgeEmulator
+from palpate_gateway.emulators.biotac_pic32 import BiotacPic32Emulator
+from palpate_gateway.emulators.biotac_slots import idle_counts
+from palpate_gateway.emulators.bota import BotaEmulator
+from palpate_gateway.emulators.emulator import no_load
 from palpate_gateway.emulators.lines import SerialLine
+from palpate_gateway.emulators.robotous import RobotousSerialEmulator
+
+PATIENCE_S = 20.0
 
 
 @pytest.fixture
@@ -74,3 +84,38 @@ def test_what_replaced_the_line_is_not_removed_with_it(
     name.symlink_to(tmp_path)
     line.close()
     assert name.readlink() == tmp_path
+
+
+def test_a_line_tells_whether_all_can_be_read(line: SerialLine) -> None:
+    assert line.write(b"heard")
+    while line.write(bytes(1000)):
+        assert line.overrun == 0
+    assert line.overrun > 0  # nobody reads, and it holds no more
+    line.unplug()
+    assert not line.write(b"lost")
+
+
+@pytest.mark.parametrize(
+    "kind", [BotaEmulator, RobotousSerialEmulator, BiotacPic32Emulator, BiotacBridgeEmulator]
+)
+def test_what_an_unplugged_device_measures_is_not_counted_as_sent(kind: Any) -> None:
+    measured = 0
+
+    def source(*at: float) -> Any:
+        nonlocal measured
+        measured += 1
+        return no_load(at[0]) if len(at) == 1 else idle_counts(at[0], 0)
+
+    if kind in (BotaEmulator, RobotousSerialEmulator):
+        emulator = kind(source)
+    else:
+        emulator = kind(counts=source)
+    if hasattr(emulator, "running"):
+        emulator.running = True  # as after the request of a host
+    emulator.inject("unplug", 1000.0)
+    with emulator:
+        deadline = time.monotonic() + PATIENCE_S
+        while measured < 1000 if kind is BiotacBridgeEmulator else measured < 10:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    assert emulator.sent == 0

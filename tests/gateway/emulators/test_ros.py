@@ -78,3 +78,16 @@ def test_a_hand_that_saturates_once_does_so_in_every_finger_of_one_message(finge
     saturated, after = (decode_hand(emulator._message(t, 10**9), BIOTAC_HAND) for t in (1.0, 1.01))
     assert [finger and set(finger.slow) for finger in saturated.fingers] == [{4095}] * fingers
     assert not any(finger and 4095 in finger.slow for finger in after.fingers)
+
+
+@pytest.mark.parametrize(("fault", "whole"), [("", 1), ("cut", 0), ("lost", 0), ("repeated", 1)])
+def test_a_message_counts_as_sent_if_it_is_whole_and_only_once(fault: str, whole: int) -> None:
+    emulator = NotedTimes(stalls_at=0)
+    if fault:
+        emulator.inject(fault, 60.0)
+    with emulator:
+        deadline = time.monotonic() + PATIENCE_S
+        while emulator._sequence < 20:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    assert emulator.sent == whole * emulator._sequence
