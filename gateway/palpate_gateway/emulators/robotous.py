@@ -13,6 +13,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+from palpate.errors import ConfigError
 from palpate.process import require
 from palpate_gateway.emulators import FAULTS
 from palpate_gateway.emulators.emulator import (
@@ -76,6 +77,11 @@ class RobotousEmulator(Emulator):
         drift_ppm: float = 200.0,
     ) -> None:
         super().__init__(_RATES_HZ[0])
+        if not serial.isascii():
+            raise ConfigError(
+                f"serial {serial!r} has a letter that is not ASCII",
+                remedy="choose another: an RFT sends up to 15 letters of ASCII",
+            )
         self._source, self._model, self._serial = source, model, serial
         self._scale = 3 * (FORCE_DIVISOR,) + 3 * (TORQUE_DIVISORS[model],)
         self._time_s, self._drift = 0.0, drift_ppm * 1e-6

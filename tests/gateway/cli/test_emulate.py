@@ -218,6 +218,7 @@ def test_an_emulator_ends_by_itself(emulate: Emulate) -> None:
         (["bota", "--trajectory", "cube/00/norml"], "did you mean 'cube/00/normal'"),
         (["bota", "--baud", "1"], "one of 57600, 115200"),
         (["robotous", "--model", "RFT"], "one of RFT40-SA01"),
+        (["robotous", "--play", "idle", "--serial", "RFT-\u00e4"], "letter that is not ASCII"),
         (["robotous", "--link", "a-file"], "a file of this name is there"),
         (["bota", "--link", "a-link"], "a-link is a link to a-file, not the name of a line"),
         (["bota", "--link", "nowhere/line"], "there is no folder nowhere"),
