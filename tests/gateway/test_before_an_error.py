@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from palpate.ros.layouts import BIOTAC_ALL, WRENCH_STAMPED, encode
 from palpate.ros.rmw_zenoh import SampleInfo
 from palpate_gateway.device import Device, DeviceIdentity
 from palpate_gateway.drivers import make_device
+from palpate_gateway.emulators.lines import crc16_x25
 from palpate_gateway.pose.robot import PoseZenoh
 from palpate_gateway.protocols.bota import BotaFrame
 from palpate_gateway.protocols.ros_hands import decode_hand
@@ -91,6 +93,20 @@ def bota() -> Device:
     return OfOneBatch(BotaOptions(port="a", rate_hz=400.0))
 
 
+def bota_boots() -> Device:
+    class OfOneRead(WrenchBota):
+        def _connect(self) -> str:
+            self._early = b"".join(bota_bytes(k) for k in range(GOOD)) + b"App Init\r\n"
+            return "a"
+
+    return OfOneRead(BotaOptions(port="a", rate_hz=400.0))
+
+
+def bota_bytes(k: int) -> bytes:
+    body = struct.pack("<H6fIf", 0, *(1.0,) * 6, 90_000_000 + 2_500 * k, 20.0)
+    return b"\xaa" + body + crc16_x25(body).to_bytes(2, "little")
+
+
 def pose_zenoh() -> Device:
     away = frame(GOOD, pose=Pose((600.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
     frames = [*(frame(k) for k in range(GOOD)), away]
@@ -114,7 +130,7 @@ def pose_zenoh() -> Device:
     return device
 
 
-@pytest.mark.parametrize("make", [ros_biotac, ros_wrench, bota, pose_zenoh])
+@pytest.mark.parametrize("make", [ros_biotac, ros_wrench, bota, bota_boots, pose_zenoh])
 def test_readings_before_an_error_are_delivered_and_counted(make: Any) -> None:
     device = make()
     with device:

@@ -277,7 +277,7 @@ class TestDeviceContract:
             bench.take(device, 1)
             bench.emulator.inject("silence", 60.0)
             assert until(lambda: _fails(device, DeviceTimeout, DeviceLost))
-        bench.emulator.inject("silence", 1e-9)
+        bench.emulator.end("silence")
 
     @hardware
     def test_a_lost_device_says_so_and_comes_back(self, bench: Bench) -> None:
@@ -293,7 +293,7 @@ class TestDeviceContract:
         device.close()
         with pytest.raises(DeviceError):
             device.open()
-        emulator.inject(bench.case.gone, 1e-9)
+        emulator.end(bench.case.gone)
         open_again(device)
         assert len(bench.take(device)) >= SOME
 

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from palpate.errors import DeviceTimeout
-from palpate_gateway.emulators.emulator import Emulator
 from palpate_gateway.readings import WrenchReading
 from palpate_gateway.wrench.device import WrenchDevice
 
@@ -81,8 +80,3 @@ def wait_for_timeout(device: WrenchDevice) -> str:
         except DeviceTimeout as error:
             return str(error)
     raise AssertionError("there was no timeout")
-
-
-def end(emulator: Emulator, fault: str) -> None:
-    """A fault that lasts is over."""
-    emulator.inject(fault, 1e-9)

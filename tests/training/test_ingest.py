@@ -11,6 +11,7 @@ import pytest
 
 from palpate.bus.topics import ELECTRODES, POSE, TARE, WRENCH, Topic, sensor_key
 from palpate.errors import DatasetError, RecordingError
+from palpate.files.record import read_record
 from palpate.files.record_writer import RecordWriter
 from palpate.messages import (
     ElectrodeFrame,
@@ -278,6 +279,28 @@ def test_record_lacks_something(record: Record, tmp_path: Path) -> None:
     only_wrench = Record(tmp_path / "only.mcap").add(WRENCH, wrench(1))
     with pytest.raises(DatasetError, match="no electrode frames"):
         ingest_record(only_wrench.write())
+
+
+def test_messages_that_break_the_contract_are_left_out_and_told(
+    record: Record, caplog: pytest.LogCaptureFixture
+) -> None:
+    record.add(TARE, tare(1, 2000.0)).add(ELECTRODES, *(frame(i) for i in range(1, 51)))
+    record.add(WRENCH, *(wrench(i) for i in range(1, 51)))
+    record.add(POSE, *(pose(i, touches=i > 20) for i in range(1, 51)))
+    path = record.write()
+    whole = ingest_record(path)
+    spoilt = path.with_name("spoilt.mcap")
+    with RecordWriter(spoilt) as writer:
+        for topic in (TARE, ELECTRODES, WRENCH, POSE):
+            key = sensor_key("lab", "finger", topic.name)
+            writer.write(key, topic.codec.schema, b"no message", log_time_ns=0)
+        for item in read_record(path):
+            writer.write(item.key, item.schema, item.payload, log_time_ns=item.log_time_ns)
+    with caplog.at_level("WARNING"):
+        data = ingest_record(spoilt)
+    np.testing.assert_array_equal(data.force, whole.force)
+    np.testing.assert_array_equal(data.tared_counts, whole.tared_counts)
+    assert "4 messages break the contract and are left out" in caplog.text
 
 
 def test_a_truncated_record_is_named(record: Record) -> None:

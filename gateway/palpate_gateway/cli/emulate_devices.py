@@ -275,7 +275,7 @@ def _robot(scene: EmulatedScene, *, name: str, **options: Any) -> EmulatedDevice
     check_name(name, "robot")
     check_name(options["station"], "station")
     _check_endpoint(options["connect"])
-    certificates = _certificates(options["tls"])
+    certificates = _certificates(options)
     tip, indenter = scene.tip()
     emulator = RobotEmulator(tip, robot=name, **options)
 
@@ -302,7 +302,7 @@ def _ros_hand(
     from palpate_gateway.emulators.ros import RosHandEmulator
 
     _check_endpoint(options["connect"])
-    certificates = _certificates(options["tls"])
+    certificates = _certificates(options)
     emulator = RosHandEmulator(
         scene.counts(fingers),
         whole_frames=message == "BioTacHand",
@@ -324,7 +324,7 @@ def _ros_wrench(scene: EmulatedScene, *, topic: str, **options: Any) -> Emulated
     from palpate_gateway.emulators.ros import RosWrenchEmulator
 
     _check_endpoint(options["connect"])
-    certificates = _certificates(options["tls"])
+    certificates = _certificates(options)
     emulator = RosWrenchEmulator(scene.wrench(), topic=check_topic_name(topic), **options)
 
     def sensors() -> list[tuple[str, Options]]:
@@ -363,9 +363,11 @@ def _topic_of(emulator: RosEmulator) -> Options:
     return {"topic": emulator.topic, "connect": emulator.address, **domain}
 
 
-def _certificates(folder: Path | None) -> Options:
-    """The option of a driver that joins the same router."""
-    return {} if folder is None else {"tls": TlsConfig.of_folder(folder).model_dump(mode="json")}
+def _certificates(options: Options) -> Options:
+    """The option of a driver that joins the same router; the emulator's own has no certificates."""
+    if not options["connect"] or options["tls"] is None:
+        return {}
+    return {"tls": TlsConfig.of_folder(options["tls"]).model_dump(mode="json")}
 
 
 def _check_endpoint(connect: str) -> None:
@@ -396,14 +398,15 @@ def _can_failures() -> Failures:
 
 def _checked_link(link: Path | None) -> str:
     """Path for the name of the line; only the name of an earlier line is replaced."""
+    from palpate_gateway.emulators.lines import reserve
+
     if link is None:
         return ""
-    if link.exists() and not link.is_symlink():
-        raise ConfigError(f"--link {link}: a file of this name is there", remedy="name another")
     if not link.parent.is_dir():
         raise ConfigError(
             f"--link {link}: there is no folder {link.parent}", remedy="make it, or name another"
         )
+    reserve(link).close()  # what is wrong with it is told before the twin is computed
     return str(link.absolute())
 
 

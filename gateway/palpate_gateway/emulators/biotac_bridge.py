@@ -205,11 +205,10 @@ class BiotacBridgeEmulator(SerialEmulator):
             if self.faulty("repeated"):
                 self._line.write(wire)
         before = self._line.overrun
-        self._line.write(wire)
-        if self._line.overrun > before:
-            self.overruns += self._together
-        else:
+        if self._line.write(wire):
             self.sent += self._together
+        elif self._line.overrun > before:
+            self.overruns += self._together
 
 
 def stuffed(packet: bytes) -> bytes:

@@ -61,13 +61,11 @@ class BiotacCanEmulator(Emulator):
         self._arguments = {**(options or {}), "interface": interface, "channel": channel}
         self._counts, self._can_id, self._drift = counts, can_id, drift_ppm * 1e-6
         order = round_of(electrodes, pac_first=pac_first)
-        self._last_place, self._slots = len(order) - 1, SlotBlocks(counts, fingers, order)
+        self._length, self._slots = 1 + 2 * fingers, SlotBlocks(counts, fingers, order)
         self._can: Any = None
         self._bus: Any = None
         self._message: Any = None
         self._off = False
-        self.frames = 0
-        """Rounds of slots that were sent complete."""
         # The next slot; the prepared block, the number of its slots that are sent, and the time at
         # which its first slot is sampled.
         self._slot = self._at = 0
@@ -134,8 +132,7 @@ class BiotacCanEmulator(Emulator):
             if not data:
                 return
         self._put(data)
-        self.sent += 1
-        self.frames += self._slot % (self._last_place + 1) == self._last_place
+        self.sent += len(data) == self._length
 
     def _with_faults(self, data: bytes) -> bytes:
         """The frame with the present faults; empty = no frame is sent."""

@@ -151,7 +151,6 @@ class BiotacPic32Emulator(SerialEmulator):
             record[5 + 2 * self._random.randrange(23)] |= 0x40
             self._line.write(record)
             return
-        self._line.write(record)
-        self.sent += 1
+        self.sent += self._line.write(record)
         if self.faulty("repeated"):
             self._line.write(record)

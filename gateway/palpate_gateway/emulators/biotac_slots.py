@@ -99,6 +99,18 @@ def count_at(counts: Sequence[int], place: int) -> int:
     return min(counts[_SP_REPEATS[place - CHANNELS]] + _SP_MORE, 4095)
 
 
+def counts_at(source: CountSource, times_s: Times, places: Indices, finger: int) -> Counts:
+    """The count of one place at each time [s], shapes (N,); E20..E24 have their places, too."""
+    if not isinstance(source, CountTrack):
+        slots = zip(times_s.tolist(), places.tolist(), strict=True)
+        return np.array([count_at(source(t, finger), place) for t, place in slots], np.int64)
+    # E20..E24 of a BioTac SP are made of nearby electrodes, as in ``count_at``.
+    known = places < CHANNELS
+    repeated = np.array(_SP_REPEATS)[np.where(known, 0, places - CHANNELS)]
+    counts = source.slots(times_s, np.where(known, places, repeated), finger)
+    return np.minimum(counts + np.where(known, 0, _SP_MORE), 4095)
+
+
 def word(value: int) -> bytes:
     """The two bytes of a count."""
     return bytes([_odd((value >> 5) << 1), _odd((value & 0x1F) << 3)])
@@ -137,7 +149,8 @@ class SlotBlocks:
         out = np.empty((count, width), np.uint8)
         out[:, 0] = self._commands[where]
         for finger in range(self._fingers):
-            out[:, 1 + 2 * finger : 3 + 2 * finger] = _WORDS[self._counts(times_s, places, finger)]
+            counts = counts_at(self._source, times_s, places, finger)
+            out[:, 1 + 2 * finger : 3 + 2 * finger] = _WORDS[counts]
         data = out.tobytes()
         return [data[at : at + width] for at in range(0, len(data), width)]
 
@@ -166,14 +179,3 @@ class SlotBlocks:
                 first = second = 0
             out += bytes([first, second])
         return bytes(out)
-
-    def _counts(self, times_s: Times, places: Indices, finger: int) -> Counts:
-        source = self._source
-        if not isinstance(source, CountTrack):
-            slots = zip(times_s.tolist(), places.tolist(), strict=True)
-            return np.array([count_at(source(t, finger), place) for t, place in slots], np.int64)
-        # E20..E24 of a BioTac SP are made of nearby electrodes, as in ``count_at``.
-        known = places < CHANNELS
-        repeated = np.array(_SP_REPEATS)[np.where(known, 0, places - CHANNELS)]
-        counts = source.slots(times_s, np.where(known, places, repeated), finger)
-        return np.minimum(counts + np.where(known, 0, _SP_MORE), 4095)

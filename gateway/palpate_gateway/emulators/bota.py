@@ -211,8 +211,7 @@ class BotaEmulator(SerialEmulator):
             wrong[self._random.randint(1, 34)] ^= 1 << self._random.randint(0, 7)
             self._line.write(wrong)
         else:
-            self._line.write(frame)
-            self.sent += 1
+            self.sent += self._line.write(frame)
             if self.faulty("repeated"):
                 self._line.write(frame)
 

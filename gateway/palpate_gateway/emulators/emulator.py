@@ -45,7 +45,7 @@ class Emulator(ABC):
             raise ValueError(f"rate_hz {rate_hz} is not in 0..100000")
         self.rate_hz = rate_hz
         self.sent = 0
-        """Samples that were sent complete and correct."""
+        """Samples that went out whole, each once; what a fault made them say does not matter."""
         self._until: dict[str, float] = {}
         self._held_s: float | None = None
         self._lock = threading.Lock()
@@ -60,12 +60,19 @@ class Emulator(ABC):
     def inject(self, fault: str, duration_s: float = 0.0) -> None:
         """Start a fault for a duration [s]; 0 = once, at the next sample.
 
+        One that acts already goes on until the later of both ends.
+
         Raises:
             ValueError: It has no such fault.
         """
         self._check(fault)
         with self._lock:
-            self._until[fault] = time.monotonic() + duration_s if duration_s > 0.0 else 0.0
+            now_s = time.monotonic()
+            until_s = now_s + duration_s if duration_s > 0.0 else 0.0
+            acts_until_s = self._until.get(fault, 0.0)
+            if acts_until_s > now_s:
+                until_s = max(until_s, acts_until_s)
+            self._until[fault] = until_s
 
     def faulty(self, fault: str) -> bool:
         """Whether a fault acts now; a call that returns True uses up a fault injected for once."""

@@ -7,10 +7,12 @@ host reads noise and its requests are lost, as on a wire.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import random
 import select
 import shutil
+import socket
 import tempfile
 import termios
 import time
@@ -18,12 +20,14 @@ import tty
 from pathlib import Path
 from typing import Any
 
+from palpate.errors import ConfigError
 from palpate_gateway.emulators.emulator import Emulator
 
 BUS_ERROR, BUS_OFF, RESTARTED = 0x080, 0x040, 0x100
 """Classes of CAN error frames: bits of the identifier (linux/can/error.h)."""
 
 _AT_ONCE = 4096
+_TERMINALS = "/dev/pts/"
 
 _SPEEDS = {
     getattr(termios, name): int(name[1:])
@@ -48,6 +52,38 @@ def speeds() -> list[int]:
     return sorted(set(_SPEEDS.values()) - {0})
 
 
+def reserve(path: str | Path) -> socket.socket:
+    """Reserve the name of a line, until the socket that is returned is closed.
+
+    Whoever ends loses its reservations, so that the name which a killed emulator left can be used
+    again, and that of a running one cannot.
+
+    Raises:
+        ConfigError: An emulator that runs has the name, or something else than a line is there.
+    """
+    path = Path(path)
+    if path.is_symlink():
+        target = os.readlink(path)
+        if not target.startswith(_TERMINALS):
+            raise ConfigError(
+                f"{path} is a link to {target}, not the name of a line", remedy="choose another"
+            )
+    elif path.exists():
+        raise ConfigError(f"{path}: a file of this name is there", remedy="choose another")
+    whole = os.path.join(os.path.realpath(path.parent), path.name)
+    guard = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        # An abstract socket: it is no file, and its name is that of one process at a time.
+        guard.bind(f"\0palpate-line-{hashlib.sha256(os.fsencode(whole)).hexdigest()}")
+    except OSError as error:
+        guard.close()
+        raise ConfigError(
+            f"{path} is the line of another emulator, which runs",
+            remedy="end that one, or choose another name",
+        ) from error
+    return guard
+
+
 class SerialLine:
     """A line to one host.
 
@@ -63,6 +99,7 @@ class SerialLine:
         """Bytes that the host was too slow to read; a wire would lose them too."""
         self._folder = ""
         self._device = self._host = -1
+        self._reserved: socket.socket | None = None
         self._noise = random.Random(baud)
 
     @property
@@ -71,25 +108,34 @@ class SerialLine:
         return self._device >= 0
 
     def plug(self) -> None:
-        """Make the line, or do nothing if it is there."""
+        """Make the line, or do nothing if it is there.
+
+        Raises:
+            ConfigError: Its name cannot be had, see ``reserve``.
+        """
         if self.plugged:
             return
         if not self.path:
             self._folder = tempfile.mkdtemp(prefix="palpate-line-")
             self.path = str(Path(self._folder) / "tty")
+        if self._reserved is None:
+            self._reserved = reserve(self.path)
         self._device, self._host = os.openpty()
         # The host's end stays open here as well, or its settings would be lost and reads would
         # fail.
         tty.setraw(self._device)
         tty.setraw(self._host)
         os.set_blocking(self._device, False)
-        Path(self.path).unlink(missing_ok=True)
+        if Path(self.path).is_symlink():
+            Path(self.path).unlink()
         Path(self.path).symlink_to(os.ttyname(self._host))
 
     def unplug(self) -> None:
         """Remove the line, as if its adapter were pulled; the name stays reserved."""
         if self.plugged:
-            Path(self.path).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # somebody may have removed or replaced it
+                if os.readlink(self.path) == os.ttyname(self._host):
+                    Path(self.path).unlink()
             os.close(self._device)
             os.close(self._host)
             self._device = self._host = -1
@@ -104,6 +150,9 @@ class SerialLine:
     def close(self) -> None:
         """Unplug for good."""
         self.unplug()
+        if self._reserved is not None:
+            self._reserved.close()
+            self._reserved = None
         if self._folder:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = self.path = ""
@@ -120,17 +169,23 @@ class SerialLine:
                 data = os.read(self._device, _AT_ONCE)
         return data if self._same_speed() else b""
 
-    def write(self, data: bytes | bytearray) -> None:
-        """Send to the host, if the line is plugged; noise if the host's speed is another one."""
+    def write(self, data: bytes | bytearray) -> bool:
+        """Send to the host, if the line is plugged; noise if the host's speed is another one.
+
+        Returns:
+            Whether the host can read all of it.
+        """
         if not self.plugged:
-            return
-        if not self._same_speed():
+            return False
+        heard = self._same_speed()
+        if not heard:
             data = self._noise.randbytes(len(data))
         try:
             taken = os.write(self._device, data)
         except OSError:
             taken = 0
         self.overrun += len(data) - taken
+        return heard and taken == len(data)
 
     def _same_speed(self) -> bool:
         set_by_host = _SPEEDS.get(termios.tcgetattr(self._host)[5])

@@ -163,7 +163,7 @@ class RdtEmulator(Emulator):
     Faults:
 
     * ``lost``: records and their numbers are missing; ``repeated``: each datagram comes twice;
-      ``late``: a record is sent after the next one;
+      ``late``: every other record is sent after the next one;
     * ``cut``: datagrams lack their second half; ``junk``: datagrams of odd lengths before them;
     * ``silence``: nothing comes, and requests are ignored; ``deaf``: requests are ignored;
     * ``restart``: the stream stops, zero and counter are reset;
@@ -295,7 +295,7 @@ class RdtEmulator(Emulator):
         if command in self._product.starts:
             self._client, self._left = client, count or None
             self._at_once = self._together if command == _START_MANY else 1
-            self._sequence, self._packet = 0, []
+            self._sequence, self._packet, self._held = 0, [], None
         elif command == _STOP:
             self._client = None
         elif command == _BIAS:
@@ -325,7 +325,7 @@ class RdtEmulator(Emulator):
             return
         if self.faulty("junk"):
             link.sendto(self._random.randbytes(self._random.choice((1, 8, 35, 37, 100))), client)
-        if self.faulty("late"):
+        if self._held is None and not ends and self.faulty("late"):
             # Kept until the next record has been sent.
             self._held = whole
             return
@@ -342,6 +342,7 @@ class RdtEmulator(Emulator):
             link.sendto(packet, client)
         if self._held is not None:
             link.sendto(self._held, client)
+            self.sent += 1
             self._held = None
 
     def _record(self) -> bytes:

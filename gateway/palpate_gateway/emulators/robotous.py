@@ -13,6 +13,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+from palpate.errors import ConfigError
 from palpate.process import require
 from palpate_gateway.emulators import FAULTS
 from palpate_gateway.emulators.emulator import (
@@ -76,6 +77,11 @@ class RobotousEmulator(Emulator):
         drift_ppm: float = 200.0,
     ) -> None:
         super().__init__(_RATES_HZ[0])
+        if not serial.isascii():
+            raise ConfigError(
+                f"serial {serial!r} has a letter that is not ASCII",
+                remedy="choose another: an RFT sends up to 15 letters of ASCII",
+            )
         self._source, self._model, self._serial = source, model, serial
         self._scale = 3 * (FORCE_DIVISOR,) + 3 * (TORQUE_DIVISORS[model],)
         self._time_s, self._drift = 0.0, drift_ppm * 1e-6
@@ -181,8 +187,7 @@ class RobotousEmulator(Emulator):
             if fault in self.faults and self.faulty(fault):
                 self._spoil(fault, data)
                 return
-        self._send(data)
-        self.sent += 1
+        self.sent += self._send(data)
         if self.faulty("repeated"):
             self._send(data)
 
@@ -191,8 +196,8 @@ class RobotousEmulator(Emulator):
         """D1..D8 of the received requests."""
 
     @abstractmethod
-    def _send(self, data: bytes) -> None:
-        """Send D1..D16."""
+    def _send(self, data: bytes) -> bool:
+        """Send D1..D16; whether they went out whole."""
 
     @abstractmethod
     def _spoil(self, fault: str, data: bytes) -> None:
@@ -236,8 +241,8 @@ class RobotousSerialEmulator(SerialEmulator, RobotousEmulator):
             self._came = self._came[length:]
         return out
 
-    def _send(self, data: bytes) -> None:
-        self._line.write(b"\x55" + data + bytes([sum(data) % 256]) + b"\xaa")
+    def _send(self, data: bytes) -> bool:
+        return self._line.write(b"\x55" + data + bytes([sum(data) % 256]) + b"\xaa")
 
     def _spoil(self, fault: str, data: bytes) -> None:
         if fault == "junk":
@@ -304,9 +309,10 @@ class RobotousCanEmulator(RobotousEmulator):
             message = self._bus.recv(0.0)
         return out
 
-    def _send(self, data: bytes) -> None:
+    def _send(self, data: bytes) -> bool:
         self._put(self.ids[1], data[:8])
         self._put(self.ids[2], data[8:])
+        return True
 
     def _spoil(self, fault: str, data: bytes) -> None:
         if fault == "junk":

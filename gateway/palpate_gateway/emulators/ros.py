@@ -18,9 +18,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+
 from palpate.bus import ForeignPublisher, Session
 from palpate_gateway.emulators import FAULTS
-from palpate_gateway.emulators.biotac_slots import ELECTRODES, CountSource, idle_counts
+from palpate_gateway.emulators.biotac_slots import CHANNELS, CountSource, counts_at, idle_counts
 from palpate_gateway.emulators.emulator import (
     SampleTicker,
     WrenchSource,
@@ -32,6 +34,12 @@ from palpate_gateway.emulators.routed import RoutedEmulator
 _SLOT_HZ = 4400.0
 _COUNTS_MAX = 4095
 _BACK_NS = 5_000_000_000
+
+_PLACES = np.array([*range(CHANNELS - 1), *[CHANNELS - 1] * 22])
+"""Channels of a frame: E1 to E19, PDC, TAC, TDC, and PAC 22 times."""
+
+_BEFORE_END_S = (44 - np.array([*range(0, 44, 2), *range(1, 44, 2)])) / _SLOT_HZ
+"""When they are sampled, before the end of their frame [s]: PAC in every other slot."""
 
 BIOTAC_ALL_KEY = (
     "sr_robot_msgs::msg::dds_::BiotacAll_/"
@@ -138,13 +146,14 @@ class RosEmulator(RoutedEmulator):
         ticker = SampleTicker(self.rate_hz, self._stop)
         began_s, began_ns = time.monotonic(), time.time_ns()
         self._set_lead(began_s)
-        tick = 0
+        last_s, clock_s = began_s, 0.0
         while not self._stop.is_set():
             ticker.fast = self._drift if self.faulty("clock_drift") else 0.0
             due_s = ticker.wait()
-            tick += 1
+            clock_s += (due_s - last_s) * (1.0 + ticker.fast)
+            last_s = due_s
             if not self._gone():
-                self._step(due_s - began_s, began_ns + round(1e9 * tick / self.rate_hz))
+                self._step(due_s - began_s, began_ns + round(1e9 * clock_s))
 
     def _set_lead(self, began_s: float) -> None:
         """What is measured follows the host's clock."""
@@ -167,6 +176,8 @@ class RosEmulator(RoutedEmulator):
         payload = self._message(self.held(t), time_ns)
         if self.faulty("cut"):
             payload = payload[:-8]
+        else:
+            self.sent += 1
         attachment = struct.pack("<qqB", self._sequence, time.time_ns(), 16) + self._gid
         if self._held is None and self.faulty("late"):
             self._held = (payload, attachment)
@@ -181,7 +192,6 @@ class RosEmulator(RoutedEmulator):
     def _tell(self, payload: bytes, attachment: bytes) -> None:
         if self._publisher is not None:
             self._publisher.put(payload, attachment)
-            self.sent += 1
 
 
 class RosHandEmulator(RosEmulator):
@@ -226,16 +236,14 @@ class RosHandEmulator(RosEmulator):
         set_lead(self._counts, began_s)
 
     def _of(self, t: float, finger: int) -> tuple[list[int], list[int]]:
-        """E1 to E19, PDC, TAC, TDC; and PAC samples of the last frame, the newest last."""
-        if self.faulty("saturated"):
-            return [_COUNTS_MAX] * 22, [_COUNTS_MAX] * 22
-        slow = list(self._counts(t, finger))[: ELECTRODES + 3]
-        stuck = self._held_s is not None
-        pac = [
-            self._counts(t - (0 if stuck else 2 * (21 - k) / _SLOT_HZ), finger)[-1]
-            for k in range(22)
-        ]
-        return slow, pac
+        """E1 to E19, PDC, TAC, TDC; and PAC samples of the frame that ends at ``t`` [s]."""
+        times_s = np.full(44, t)
+        if self._held_s is None:
+            # Only a BioTacHand says when each of the others was sampled.
+            first = 0 if self.whole_frames else 22
+            times_s[first:] -= _BEFORE_END_S[first:]
+        counts = counts_at(self._counts, times_s, _PLACES, finger).tolist()
+        return counts[:22], counts[22:]
 
     def _message(self, t: float, time_ns: int) -> bytes:
         fingers = 0 if self.faulty("absent") else self._fingers
@@ -243,6 +251,8 @@ class RosHandEmulator(RosEmulator):
         cdr.time(time_ns)
         cdr.text("hand")
         measured = [self._of(t, finger) for finger in range(fingers)]
+        if self.faulty("saturated"):
+            measured = [([_COUNTS_MAX] * 22, [_COUNTS_MAX] * 22)] * fingers
         if self.whole_frames:
             self._write_hand(cdr, time_ns, measured)
         else:

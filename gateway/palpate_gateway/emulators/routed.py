@@ -25,12 +25,12 @@ class RoutedEmulator(Emulator):
         rate_hz: Its messages each second [Hz].
         connect: Endpoint of the router; empty = its own.
         port: Of its own; 0 = any free one.
-        tls: Folder of certificates for the router.
+        tls: Folder of certificates for the router; its own has none.
     """
 
     def __init__(self, rate_hz: float, connect: str, port: int, tls: Path | None) -> None:
         super().__init__(rate_hz)
-        self._connect, self._port, self._tls = connect, port, tls
+        self._connect, self._port, self._tls = connect, port, tls if connect else None
         self._router: threading.Thread | None = None
         self._session: Session | None = None
         self._publisher: Publisher[Any] | ForeignPublisher | None = None
@@ -80,7 +80,7 @@ class RoutedEmulator(Emulator):
             self._router.start()
         try:
             self._join()
-        except LinkError:
+        except BaseException:  # a router that still runs would keep the program alive
             self._stop.set()
             self._hang_up()
             raise

@@ -6,6 +6,7 @@ those. This driver computes them again from the robot's poses, e.g. with a bette
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
@@ -16,7 +17,6 @@ from palpate.bus.topics import POSE, ROBOT_POSE
 from palpate.config import Name
 from palpate.errors import RecordingError, WireError
 from palpate.files.record import RecordItem, only_name, read_record
-from palpate.messages import RobotPoseFrame
 from palpate_gateway.device import DeviceIdentity, FileDevice
 from palpate_gateway.pose.placement import Placement, PlacementOptions, within_reach
 from palpate_gateway.pose.table import PoseRow, PoseTable
@@ -40,6 +40,7 @@ class RecordedPoses:
         self._path = path
         self._track = PoseTrack()
         self._restarts = 0
+        self._rejected: Counter[str] = Counter()
         self._robot = robot or only_name(path, ROBOT_POSE.name, "robot")
         if not self._robot:
             raise self._no_poses()
@@ -48,8 +49,8 @@ class RecordedPoses:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Lost and dropped poses, and ``restarts`` of the robot's program."""
-        return {**self._track.counters, "restarts": self._restarts}
+        """Lost, dropped and rejected poses, and ``restarts`` of the robot's program."""
+        return {**self._track.counters, **self._rejected, "restarts": self._restarts}
 
     def close(self) -> None:
         """Do nothing: the record is closed after each reading."""
@@ -64,7 +65,11 @@ class RecordedPoses:
         since_s = last_s = 0.0
         first_log_ns = 0
         for item in self._items():
-            frame = self._decoded(item)
+            try:
+                frame = ROBOT_POSE.codec.decode(item.payload)
+            except WireError as error:  # the recorder keeps what breaks the contract
+                self._rejected[f"rejected_{error.reason}"] += 1
+                continue
             verdict = self._track.take(frame)
             if verdict is PoseVerdict.RESTARTED:
                 # Only the recorder's clock spans both runs; its times include the delay of the bus.
@@ -89,15 +94,6 @@ class RecordedPoses:
         for item in read_record(self._path):
             if item.address.topic == ROBOT_POSE.name and item.address.sensor == self._robot:
                 yield item
-
-    def _decoded(self, item: RecordItem) -> RobotPoseFrame:
-        try:
-            return ROBOT_POSE.codec.decode(item.payload)
-        except WireError as error:
-            raise RecordingError(
-                f"{self._path}: a pose of robot {self._robot!r} is damaged: {error.problem}",
-                remedy="replay another record; this one broke the contract when written",
-            ) from error
 
     def _no_poses(self) -> RecordingError:
         return RecordingError(

@@ -107,7 +107,7 @@ class WrenchBota(WrenchDevice):
     def _begin(self) -> None:
         """Reset the state of an earlier connection."""
         self._decoder = BotaDecoder()
-        self._boot = wire.BotaTextWait(wire.BOOT_TEXT)
+        self._boot, self._booted = wire.BotaTextWait(wire.BOOT_TEXT), False
         self._early = b""
         self._clock = SampleClock(self._period_us, _WRAP_US)
 
@@ -189,7 +189,7 @@ class WrenchBota(WrenchDevice):
     def _run(self) -> None:
         self._early = self._ask(wire.RUN_REQUEST)
         self._decoder.reset()
-        self._boot = wire.BotaTextWait(wire.BOOT_TEXT)
+        self._boot, self._booted = wire.BotaTextWait(wire.BOOT_TEXT), False
         self._clock.pause()
         self._silent_since = None
 
@@ -202,11 +202,17 @@ class WrenchBota(WrenchDevice):
         return self._before_error(self._take(frame) for frame in frames)
 
     def _frames(self, timeout_s: float) -> list[BotaFrame]:
-        data, self._early = self._early, b""
-        data = data or self._port.read(timeout_s)
-        if self._boot.feed(data) is not None:
+        frames: list[BotaFrame] = []
+        if not self._booted:
+            data, self._early = self._early, b""
+            data = data or self._port.read(timeout_s)
+            after = self._boot.feed(data)
+            self._booted = after is not None
+            # What came before the text was measured before the restart.
+            frames = self._decoder.feed(data[: len(data) - len(after or b"")])
+        if self._booted and not frames:
             raise self._restarted("it wrote its boot text")
-        return self._decoder.feed(data)
+        return frames
 
     def _take(self, frame: BotaFrame) -> WrenchReading | None:
         """The reading of a frame; None if the frame is not new or not valid."""

@@ -218,7 +218,9 @@ def test_an_emulator_ends_by_itself(emulate: Emulate) -> None:
         (["bota", "--trajectory", "cube/00/norml"], "did you mean 'cube/00/normal'"),
         (["bota", "--baud", "1"], "one of 57600, 115200"),
         (["robotous", "--model", "RFT"], "one of RFT40-SA01"),
+        (["robotous", "--play", "idle", "--serial", "RFT-\u00e4"], "letter that is not ASCII"),
         (["robotous", "--link", "a-file"], "a file of this name is there"),
+        (["bota", "--link", "a-link"], "a-link is a link to a-file, not the name of a line"),
         (["bota", "--link", "nowhere/line"], "there is no folder nowhere"),
         (["biotac-can", "--bus", "port"], "KEY=VALUE"),
     ],
@@ -228,10 +230,12 @@ def test_wrong_words_for_emulators(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a-file").write_text("precious")
+    (tmp_path / "a-link").symlink_to("a-file")
     result = CliRunner().invoke(app, ["emulate", *arguments])
     assert result.exit_code == 2
     assert told in result.stderr
     assert (tmp_path / "a-file").read_text() == "precious"
+    assert (tmp_path / "a-link").readlink() == Path("a-file")
 
 
 def test_an_address_that_is_taken() -> None:

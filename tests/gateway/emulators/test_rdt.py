@@ -206,6 +206,15 @@ def test_lost_repeated_late() -> None:
                 assert len(steps) < 1000
 
 
+def test_late_for_a_while_is_every_other_record_and_loses_none() -> None:
+    with running() as (emulator, link):
+        emulator.inject("late", 60.0)
+        link.send(struct.pack(">HHI", 0x1234, 2, 9))
+        assert [r[0] for r in take(link, 9)] == [2, 1, 4, 3, 6, 5, 8, 7, 9]
+        assert quiet(link)
+    assert emulator.sent == 9
+
+
 @pytest.mark.parametrize("fault", ["cut", "junk"])
 def test_datagrams_of_a_wrong_length(fault: str) -> None:
     with running() as (emulator, link):

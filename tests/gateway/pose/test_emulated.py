@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.errors import DeviceLost, DeviceTimeout
+from palpate.errors import ConfigError, DeviceLost, DeviceTimeout
 from palpate.messages import Pose
 from palpate_deploy.cli.app import app
 from palpate_gateway.device import Device
@@ -146,6 +150,32 @@ def test_a_port_that_is_taken_is_told() -> None:
     with RobotEmulator() as emulator, pytest.raises(OSError, match="in use"):
         RobotEmulator(port=int(emulator.address.rpartition(":")[2])).start()
     assert not [t for t in threading.enumerate() if t.name == "RobotEmulator"]
+
+
+def test_a_robot_that_cannot_join_leaves_no_router_behind() -> None:
+    before = set(threading.enumerate())
+    with pytest.raises(ConfigError, match="Zenoh key"):
+        RobotEmulator(station="My Lab").start()
+    left = {t for t in threading.enumerate() if not t.daemon} - before
+    for thread in left:
+        thread.join(PATIENCE_S)
+    assert not [thread for thread in left if thread.is_alive()]
+
+
+def test_certificates_of_another_router_are_not_its_own(tmp_path: Path) -> None:
+    for name in ("ca.pem", "cert.pem", "key.pem"):
+        (tmp_path / name).write_text("of the station")
+    words = ["emulate", "robot", "--play", "press", "--seconds", "0.5"]
+    ran = subprocess.run(
+        [sys.executable, "-m", "palpate_deploy", *words],
+        env=os.environ | {"PALPATE_TLS": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=60.0,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "tls" not in ran.stdout
 
 
 def test_the_twins_tip_runs_straight_between_frames() -> None:

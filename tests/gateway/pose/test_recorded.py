@@ -97,6 +97,18 @@ def test_one_of_several_robots(tmp_path: Path) -> None:
         drain(path, robot="middle")
 
 
+def test_a_pose_that_breaks_the_contract_is_left_out_and_counted(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    key = sensor_key("lab", "arm", ROBOT_POSE.name)
+    payloads = [ROBOT_POSE.codec.encode(fakes.frame(n)) for n in range(1, 6)]
+    with RecordWriter(path) as writer:
+        for number, payload in enumerate([b"no pose", *payloads[:3], b"no pose", *payloads[3:]]):
+            writer.write(key, ROBOT_POSE.codec.schema, payload, log_time_ns=WALL_NS + number)
+    readings, counters, _ = drain(path)
+    assert fakes.numbers(readings) == [1, 2, 3, 4, 5]
+    assert counters == {"samples": 5, "rejected_parse": 2}
+
+
 def test_a_record_of_something_else(tmp_path: Path) -> None:
     with RecordWriter(tmp_path / "a.mcap") as writer:
         writer.write("palpate/@v1/lab/x/tare", "palpate.v1.Tare", b"", log_time_ns=1)

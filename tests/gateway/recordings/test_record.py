@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate.bus.topics import FEATURES, sensor_key
+from palpate.bus.topics import ELECTRODES, FEATURES, sensor_key
 from palpate.errors import ConfigError, RecordingError
 from palpate.files.record import read_record
 from palpate.files.record_writer import RecordWriter
@@ -38,6 +38,22 @@ def test_estimates_are_not_replayed(record: Callable[..., Path], tmp_path: Path)
             sensor_key("lab", "finger", FEATURES.name), FEATURES.codec.schema, b"x", log_time_ns=1
         )
     assert "features" not in {m.topic for m in messages(other)}
+
+
+def test_a_first_frame_that_breaks_the_contract_does_not_prevent_a_replay(
+    record: Callable[..., Path], tmp_path: Path
+) -> None:
+    path, spoilt = record(60), tmp_path / "spoilt.mcap"
+    with RecordWriter(spoilt) as writer:
+        key = sensor_key("lab", "finger", ELECTRODES.name)
+        writer.write(key, ELECTRODES.codec.schema, b"no frame", log_time_ns=1)
+        for item in read_record(path):
+            writer.write(item.key, item.schema, item.payload, log_time_ns=item.log_time_ns)
+    with (
+        make_device("record", {"path": path}) as whole,
+        make_device("record", {"path": spoilt}) as device,
+    ):
+        assert device.identity == whole.identity
 
 
 def test_one_of_several_sensors(record: Callable[..., Path]) -> None:

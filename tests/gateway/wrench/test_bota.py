@@ -170,13 +170,13 @@ def test_a_zero_that_fails_has_cost_the_one_before() -> None:
         with pytest.raises(DeviceError, match="not valid now"):
             device.take_zero()
         assert not device.zero_lost, "it had none"
-        sensor.inject("overload", 1e-9)
+        sensor.end("overload")
         device.take_zero()
         sensor.inject("overload", 60.0)
         with pytest.raises(DeviceError, match="not valid now"):
             device.take_zero()
         assert (device.zero_lost, device.counters["zero_lost"]) == (True, 1)
-        sensor.inject("overload", 1e-9)
+        sensor.end("overload")
         device.take_zero()
         assert not device.zero_lost
         assert Follower(device, WrenchReading).more(1)[0].force == pytest.approx(0.0, abs=1e-3)

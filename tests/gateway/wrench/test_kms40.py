@@ -127,7 +127,7 @@ def test_silence_is_a_timeout_and_ends(emulator: Kms40Emulator, device: WrenchKm
     assert "nothing came within 0." in fakes.wait_for_timeout(device)
     while not device.counters.get("flags_unanswered"):
         fakes.wait_for_timeout(device)
-    fakes.end(emulator, "silence")
+    emulator.end("silence")
     fakes.read_until(device, lambda readings: len(readings) >= 50)
 
 
@@ -138,7 +138,7 @@ def test_a_lost_connection_is_found_and_opened_again(emulator: Kms40Emulator, fa
         emulator.inject(fault, 100.0 if fault == "unplug" else 0.0)
         with pytest.raises(DeviceLost, match="is gone"):
             fakes.read_until(device, lambda _: False)
-        fakes.end(emulator, fault)
+        emulator.end(fault)
         open_again(device)
         fakes.read_until(device, lambda readings: len(readings) >= 50)
         assert emulator.divider == 2

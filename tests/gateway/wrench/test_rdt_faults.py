@@ -35,7 +35,7 @@ def test_silence_is_a_timeout_and_ends() -> None:
         assert "nothing came within 0." in fakes.wait_for_timeout(device)
         while not device.counters.get("starts_repeated"):
             fakes.wait_for_timeout(device)
-        fakes.end(emulator, "silence")
+        emulator.end("silence")
         fakes.read_until(device, lambda readings: len(readings) >= 50)
 
 
@@ -56,7 +56,7 @@ def test_unplugged_it_is_found_and_opened_again() -> None:
         emulator.inject("unplug", 100.0)
         with pytest.raises(DeviceLost, match="is gone"):
             fakes.read_until(device, lambda _: False)
-        fakes.end(emulator, "unplug")
+        emulator.end("unplug")
         open_again(device)
         fakes.read_until(device, lambda readings: len(readings) >= 50)
 
@@ -101,13 +101,13 @@ def test_a_scale_that_changed_while_the_stream_was_interrupted_is_noticed() -> N
         emulator.inject("silence", 100.0)
         while not device.counters.get("starts_repeated"):
             fakes.wait_for_timeout(device)
-        fakes.end(emulator, "silence")
+        emulator.end("silence")
         fakes.take(device, 50)  # the same as before
         emulator.inject("silence", 100.0)
         emulator.page.content = page("Net F/T", (1e4, 1e5), ("N", "Nm"))
         emulator._counts_per_si = np.repeat((1e4, 1e5), 3)
         fakes.wait_for_timeout(device)
-        fakes.end(emulator, "silence")
+        emulator.end("silence")
         with pytest.raises(DeviceLost, match=r"were 1e\+06 and 1e\+06, and are 10000 and 100000"):
             fakes.take(device, 10_000)
         open_again(device)

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from palpate import __version__
 from palpate.alignment import AlignmentClock, Stamped, common_clock, linear, times_of
 from palpate.bus import topics
-from palpate.errors import DatasetError
+from palpate.errors import DatasetError, WireError
 from palpate.files.record import read_record
 from palpate.messages import (
     NO_TARE,
@@ -51,6 +51,10 @@ TOUCH_N = 0.2
 
 PRESS_N = 0.5
 """What does not reach this force is no press [N]."""
+
+_STREAMS: Mapping[str, topics.Topic[Any]] = {
+    topic.name: topic for topic in (topics.ELECTRODES, topics.WRENCH, topics.POSE, topics.TARE)
+}
 
 Times = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -146,30 +150,33 @@ def rows_of_streams(
 def read_streams(path: Path) -> dict[str, SensorStreams]:
     """Streams of every sensor of a record, by name, in order of writing.
 
+    Messages that break the contract, which the recorder keeps, are left out, and the log tells it.
+
     Raises:
         RecordingError: Not a whole record.
     """
     sensors: dict[str, SensorStreams] = {}
+    rejected = 0
     for item in read_record(path):
-        sensor = item.address.sensor
-        topic = item.address.topic
-        if topic not in (
-            topics.ELECTRODES.name,
-            topics.WRENCH.name,
-            topics.POSE.name,
-            topics.TARE.name,
-        ):
+        topic = _STREAMS.get(item.address.topic)
+        if topic is None:
             continue
-        streams = sensors.setdefault(sensor, SensorStreams())
-        if topic == topics.ELECTRODES.name:
-            streams.frames.append(topics.ELECTRODES.codec.decode(item.payload))
-        elif topic == topics.WRENCH.name:
-            streams.wrenches.append(topics.WRENCH.codec.decode(item.payload))
-        elif topic == topics.POSE.name:
-            streams.poses.append(topics.POSE.codec.decode(item.payload))
+        streams = sensors.setdefault(item.address.sensor, SensorStreams())
+        try:
+            message = topic.codec.decode(item.payload)
+        except WireError:
+            rejected += 1
+            continue
+        if isinstance(message, ElectrodeFrame):
+            streams.frames.append(message)
+        elif isinstance(message, WrenchFrame):
+            streams.wrenches.append(message)
+        elif isinstance(message, IndenterPoseFrame):
+            streams.poses.append(message)
         else:
-            tare = topics.TARE.codec.decode(item.payload)
-            streams.tares[tare.tare_id] = tare
+            streams.tares[message.tare_id] = message
+    if rejected:
+        _log.warning("%s: %d messages break the contract and are left out", path, rejected)
     return sensors
 
 
