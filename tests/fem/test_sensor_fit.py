@@ -23,7 +23,7 @@ from palpate_fem.electrodes.specimen import SENSING, SpecimenParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.population.explain import ANGLE_SD_RAD, TouchExplainer, TouchPrior
+from palpate_fem.population.explain import ANGLE_SD_RAD, SPREAD, TouchExplainer, TouchPrior
 from palpate_fem.population.members import read_population
 from palpate_fem.population.press_library import PressLibrary
 from palpate_fem.population.responses import Population
@@ -143,7 +143,7 @@ def test_a_planted_sensor_is_found_and_its_later_touches_are_told(bench: Bench) 
     fit = fit_sensor(
         bench.model, bench.library, bench.touches, on_round=lambda _, spread: rounds.append(spread)
     )
-    assert rounds[-1] < 0.5 * rounds[0]
+    assert rounds[-1] < min(rounds[0], 4 * NOISE_COUNTS)
     assert fit.learned is not None
     assert fit.learned.warmth == pytest.approx(0.057, abs=0.03)
     for name, before in misses(nominal).items():
@@ -152,6 +152,61 @@ def test_a_planted_sensor_is_found_and_its_later_touches_are_told(bench: Bench) 
     assert by_touches > 0.97
     assert by_touches > explained(bench, rest.specimen) + 0.02
     assert by_touches > explained(bench, nominal) + 0.5
+
+
+def touch_of(bench: Bench) -> SensorTouches:
+    """The first press of the library at 3 N, as the planted sensor reads it."""
+    sensor = bench.model.with_specimen(PLANTED)
+    counts = sensor.of_gap(bench.library.gaps[1]).counts
+    return SensorTouches("planted", bench.touches.rest, counts[None], bench.library.force[1:2])
+
+
+def first_press(bench: Bench, times: int = 1) -> PressLibrary:
+    """The library's first press alone, so many times."""
+    library, steps = bench.library, len(STEPS_N)
+    states = np.tile(np.arange(steps), times)
+    return PressLibrary(
+        library.rest,
+        [library.gaps[state] for state in states],
+        library.force[states],
+        library.place[states],
+        np.repeat(np.arange(times), steps),
+    )
+
+
+def test_a_touch_counts_however_many_presses_it_may_have_been(bench: Bench) -> None:
+    touch = touch_of(bench)
+    rest = fit_sensor(bench.model, first_press(bench), touch.some(slice(0, 0)))
+    once, often = (
+        fit_sensor(bench.model, first_press(bench, times), touch, rounds=1) for times in (1, 60)
+    )
+    assert once.specimen.side_closing_m > 1.2 * rest.specimen.side_closing_m
+    for name in ("sigma_s_m", "side_closing_m", "clamp_closing", "core_offset_m"):
+        value = getattr(once.specimen, name)
+        assert getattr(often.specimen, name) == pytest.approx(value, rel=1e-3), name
+
+
+def test_a_fit_does_not_end_before_the_touches_were_fitted(bench: Bench) -> None:
+    """Not even where electrodes deviate from the start by as much as is assumed of unknown ones."""
+    library, touch = first_press(bench), touch_of(bench)
+    rest = fit_sensor(bench.model, library, touch.some(slice(0, 0)))
+    explainer = TouchExplainer(bench.model.with_specimen(rest.specimen), library)
+    by_force = explainer.explain(touch, TouchPrior(), given=np.zeros(SENSING, bool))
+    expected = touch.rest + by_force.tared
+    off = np.where(np.arange(SENSING) % 2, 1.0, -1.0)
+    # What is left is linear in the deviation.
+    left = explainer.explain(replace(touch, counts=expected + off), TouchPrior()).left
+    fit = fit_sensor(bench.model, library, replace(touch, counts=expected + SPREAD / left * off))
+    assert fit.specimen != rest.specimen
+
+
+def test_what_touches_teach_is_told_of_the_specimen_that_is_returned(bench: Bench) -> None:
+    fit = fit_sensor(bench.model, bench.library, bench.touches, rounds=1)
+    assert fit.learned is not None
+    explainer = TouchExplainer(bench.model.with_specimen(fit.specimen), bench.library)
+    own = explainer.learn(bench.touches).learned
+    assert fit.learned.spread == pytest.approx(own.spread, rel=0.1)
+    assert fit.learned.warmth == pytest.approx(own.warmth, abs=0.02)
 
 
 def test_without_touches_only_the_rest_is_fitted(bench: Bench) -> None:
