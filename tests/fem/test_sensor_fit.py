@@ -308,6 +308,7 @@ def write_recording(
     path: Path,
     *,
     rows_of: tuple[Floats, Floats, Floats] | None = None,
+    group: Floats | None = None,
     leave_out: str = "",
     names: tuple[str, ...] = ("mine",),
 ) -> Path:
@@ -315,10 +316,12 @@ def write_recording(
     rows = len(counts)
     columns: dict[str, tuple[str, Any]] = {
         "electrodes": ("counts", counts.astype(np.uint16)),
-        "baseline": ("counts", np.tile(rest, (rows, 1)).astype(np.float32)),
+        "baseline": ("counts", np.broadcast_to(rest, counts.shape).astype(np.float32)),
         "force": ("N", force.astype(np.float32)),
         "sensor": ("1", np.zeros(rows, np.int32)),
     }
+    if group is not None:
+        columns["group"] = ("1", group.astype(np.int32))
     with h5py.File(path, "w") as file:
         file.attrs.update({**FEATURES.facts, "sensor_names": list(names)})
         for name, (unit, values) in columns.items():
@@ -355,6 +358,37 @@ def test_a_recording_is_read_or_refused(tmp_path: Path) -> None:
     for call, words in cases:
         with pytest.raises(DatasetError, match=words):
             call()
+
+
+def test_touches_are_tared_by_the_tare_that_was_in_force(tmp_path: Path) -> None:
+    """The same dents, with one electrode near the converter's end, after each of two tares."""
+    rest = np.repeat([2700.0, 2500.0], 120)[:, None] * np.ones(SENSING)
+    counts = rest + np.tile(np.repeat([-400.0, 600.0], 60), 2)[:, None]
+    counts[:, 0] = np.tile(np.repeat([4000.0, 3000.0], 60), 2)
+    force = np.tile([0.0, 0.0, 4.0], (len(counts), 1))
+    touches = read_touches(write_recording(tmp_path / "a.h5", rows_of=(rest, counts, force)))
+    np.testing.assert_array_equal(touches.tared[:, 1], [-400, 600, -400, 600])
+    np.testing.assert_array_equal(touches.some(slice(2, 4)).tared[:, 1], [-400, 600])
+    np.testing.assert_array_equal(touches.counts[:, 0], [4000, 3000, 4000, 3000])
+    np.testing.assert_array_equal(touches.rest, np.full(SENSING, 2700.0))
+    # An electrode at its end is refused, even if the first tare was higher.
+    counts[180:, 0] = 0.0
+    with pytest.raises(DatasetError, match="counts is from 0"):
+        read_touches(write_recording(tmp_path / "b.h5", rows_of=(rest, counts, force)))
+    with pytest.raises(DatasetError, match="240 rows of counts, 3 of baseline"):
+        touches_of("mine", REST, counts, force, baseline=rest[:3])
+    with pytest.raises(DatasetError, match="baseline is not finite"):
+        touches_of("mine", REST, counts, force, baseline=np.nan * rest)
+
+
+def test_a_touch_is_of_one_press(tmp_path: Path) -> None:
+    """Two presses at which the electrodes read the same, with different forces."""
+    counts = np.full((120, SENSING), 2000.0)
+    force = np.repeat([[0.0, 0.0, 4.0], [3.0, 0.0, 0.0]], 60, axis=0)
+    rows_of = REST, counts, force
+    apart = write_recording(tmp_path / "apart.h5", rows_of=rows_of, group=np.repeat([0.0, 1.0], 60))
+    np.testing.assert_array_equal(read_touches(apart).force, force[[0, 60]])
+    assert len(read_touches(write_recording(tmp_path / "one.h5", rows_of=rows_of))) == 1
 
 
 def test_the_digest_is_of_all_columns_of_a_data_set() -> None:
