@@ -81,6 +81,17 @@ def test_fit_finds_the_range_of_a_planted_specimen(
     assert specimen.name == "one"
 
 
+@pytest.mark.parametrize("asperity_m", [80e-6, 47e-6])
+def test_a_fit_stays_within_the_limits_of_a_specimen(
+    sensor: ElectrodeModel, states: tuple[list[Gap], Gap], asperity_m: float
+) -> None:
+    """Electrodes that hardly fall ask for a film under pressure as thick as it may be."""
+    pressed, rest = states
+    start = replace(SpecimenParameters(), floor_m=45e-6, asperity_m=asperity_m)
+    specimen, _ = fit_specimen(sensor.with_specimen(start), pressed[:2], rest, (-0.02, 0.1))
+    assert specimen.floor_m == pytest.approx(min(50e-6, asperity_m), rel=0.01)
+
+
 def test_thinner_films_at_the_sides_rest_lower_and_rise_more(
     sensor: ElectrodeModel, states: tuple[list[Gap], Gap]
 ) -> None:
