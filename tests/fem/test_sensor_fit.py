@@ -264,6 +264,17 @@ def test_candidates_have_the_measured_size_of_force(bench: Bench) -> None:
     np.testing.assert_allclose(size[there], wanted[there], rtol=1e-9)
 
 
+def test_candidates_of_a_press_that_dips_have_the_measured_size_too(bench: Bench) -> None:
+    sizes = np.array([2.0, 1.0, 3.0, 2.5, 4.0, 1.0])
+    force = sizes[:, None] * [0.0, 0.0, 1.0]
+    gaps, press = [bench.library.rest] * len(sizes), np.zeros(len(sizes), np.int64)
+    library = PressLibrary(bench.library.rest, gaps, force, np.zeros((len(sizes), 3)), press)
+    wanted = np.array([2.0, 2.2, 3.0, 3.5, 4.0])
+    found = library.candidates(wanted[:, None] * [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(found.at(library.force)[:, 0, 2], wanted)
+    assert ((found.share >= 0) & (found.share <= 1)).all()
+
+
 def recording() -> tuple[Floats, Floats]:
     """Three holds; the second moves too little to be another touch, and one is too short."""
     rng = np.random.default_rng(0)
