@@ -183,7 +183,7 @@ def deep_states(
             (),
         )
         at = [deep.deepest(extra) for extra in OVERTRAVELS_M]
-        gap_of = {k: sensor.finder.of_step(nodes, steps[k]) for k in set(at) if k >= 0}
+        gap_of = {k: sensor.finder.of_step(nodes, steps[k]).for_counts() for k in set(at) if k >= 0}
         found.append(replace(deep, gaps=tuple(gap_of.get(k) for k in at)))
         if on_trajectory is not None:
             on_trajectory()

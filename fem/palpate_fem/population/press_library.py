@@ -161,7 +161,7 @@ def read_library(
         trajectory = store.trajectory(name)
         steps = trajectory.steps[: clear_steps(trajectory, fingertip.mesh.fixed)]
         some = [step for step in steps if np.linalg.norm(step.force) >= LEAST_N]
-        gaps += [sensor.finder.of_step(nodes, step) for step in some]
+        gaps += [sensor.finder.of_step(nodes, step).for_counts() for step in some]
         force += [step.force for step in some]
         place += [step.centre_of_pressure for step in some]
         press += [number] * len(some)

@@ -205,7 +205,8 @@ def fit_sensor(
         model = sensor.with_specimen(specimen_at(at, sensor.specimen))
         return TouchExplainer(model, library).explain(touches, prior, places=places)
 
-    learned, done = None, 0
+    learned: TouchPrior | None = None
+    done = 0
     if places is not None:
         found = explained(places, TouchPrior())
         for done in range(1, rounds + 1):

@@ -176,8 +176,8 @@ def touches_of(
             f"{name}: touches of {rows} rows that move by {still:g} counts",
             remedy="give at least one row and more than 0 counts",
         )
-    columns = {"force": force, "baseline": baseline, "group": group}
-    for label, values in columns.items():
+    others: dict[str, NDArray[Any] | None] = {"force": force, "baseline": baseline, "group": group}
+    for label, values in others.items():
         if values is not None and len(values) != len(counts):
             raise DatasetError(
                 f"{name}: {len(counts)} rows of counts, {len(values)} of {label}", remedy=_REMEDY
@@ -185,7 +185,7 @@ def touches_of(
     if not (np.isfinite(counts).all() and np.isfinite(force).all()):
         raise DatasetError(f"{name}: counts or force are not finite", remedy=_REMEDY)
     tared = np.asarray(counts if baseline is None else counts - baseline, np.float64)
-    cuts = [] if group is None else (np.flatnonzero(np.diff(group)) + 1).tolist()
+    cuts: list[int] = [] if group is None else (np.flatnonzero(np.diff(group)) + 1).tolist()
     stretches = [
         slice(start + one.start, start + one.stop)
         for start, end in pairwise([0, *cuts, len(counts)])
