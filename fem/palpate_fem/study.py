@@ -176,9 +176,8 @@ def _press(
         )
         if name in last:
             change = (force - last[name].force) / force
-            moved = (
-                now.displacement if now.nodes is last[name].nodes else _at(now, last[name].nodes)
-            )
+            same = np.array_equal(now.nodes, last[name].nodes)
+            moved = now.displacement if same else _at(now, last[name].nodes)
             away = np.linalg.norm(moved - last[name].displacement, axis=1)
             mean, largest = float(away.mean()), float(away.max())
         last[name] = now

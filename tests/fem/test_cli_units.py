@@ -15,8 +15,15 @@ from typer.testing import CliRunner
 from palpate.errors import ConfigError, DatasetError
 from palpate_fem.cli.app import fem_app
 from palpate_fem.cli.identify import store_overtravel_m
+from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.population.fitting import misses
-from palpate_fem.population.members import PAPER, draw_members, read_population
+from palpate_fem.population.members import (
+    PAPER,
+    Member,
+    draw_members,
+    read_population,
+    write_population,
+)
 from palpate_fem.store.read import SimulationStore
 from palpate_fem.store.writer import StoreWriter
 from palpate_fem.trajectory import ANGLED_DEPTH_M, CLEARANCE_M, NORMAL_DEPTH_M
@@ -35,6 +42,14 @@ def test_show_names_each_unit_with_what_it_was_fitted_to() -> None:
     assert [one["unit"]["name"] for one in json.loads(as_json.output)] == [
         wanted.name for wanted in PAPER
     ]
+
+
+def test_units_of_which_nothing_was_found_are_shown(tmp_path: Path) -> None:
+    path = tmp_path / "mine.json"
+    write_population(path, [Member(SpecimenParameters(name="one"), PAPER[0], 0.0)], source="a test")
+    shown = CliRunner().invoke(fem_app, ["units", "show", str(path)], env={"COLUMNS": "100"})
+    assert shown.exit_code == 0, shown.output
+    assert f"- ({PAPER[0].max_force_n})" in shown.output
 
 
 def test_what_cannot_be_fitted_or_shown_is_refused(tmp_path: Path) -> None:

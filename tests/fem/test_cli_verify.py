@@ -28,12 +28,13 @@ CASES = (
     VerificationCase("hertz", lambda: Measurement(1.01, 1.0), 1e-3, "N"),
     VerificationCase("patch test", lambda: Measurement(0.0, note="to the last bit"), 1e-12),
     VerificationCase("skin/filled", _absent, 1e-2, "kPa"),
+    VerificationCase("skin/thickness", lambda: Measurement(1.011, 1.0), 1.5e-2, "mm"),
 )
 
 
 @pytest.fixture(autouse=True)
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path | None]:
-    """Three checks instead of the suite; the folders that it is asked to look in."""
+    """Four checks instead of the suite; the folders that it is asked to look in."""
     folders: list[Path | None] = []
 
     def run(
@@ -63,13 +64,14 @@ def _row(result: Result, name: str) -> list[str]:
 def test_every_check_is_told() -> None:
     done = verify()
     assert done.exit_code == 1
-    assert "1 of 3 passed, 1 skipped" in done.stdout
+    assert "2 of 4 passed, 1 skipped" in done.stdout
     assert _row(done, "hertz") == ["hertz", "1.01", "1", "N", "0.001", "FAILED"]
     assert _row(done, "patch test")[-2:] == ["ok", "to the last bit"]
+    assert _row(done, "skin/thickness") == ["skin/thickness", "1.011", "1", "mm", "0.015", "ok"]
 
 
 def test_what_is_skipped_says_why_and_fails_nothing() -> None:
-    done = verify("--only", "skin")
+    done = verify("--only", "skin/filled")
     assert done.exit_code == 0
     assert _row(done, "skin/filled") == [
         *("skin/filled", "kPa", "0.01", "skipped"),
@@ -79,7 +81,7 @@ def test_what_is_skipped_says_why_and_fails_nothing() -> None:
 
 def test_json_is_json() -> None:
     checks = {check["name"]: check for check in json.loads(verify("--json").stdout)}
-    assert [check["passed"] for check in checks.values()] == [False, True, True]
+    assert [check["passed"] for check in checks.values()] == [False, True, True, True]
     skipped = checks["skin/filled"]
     assert (skipped["skipped"], skipped["value"], skipped["unit"]) == (True, None, "kPa")
 

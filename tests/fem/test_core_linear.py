@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 from collections.abc import Callable
 
@@ -127,6 +128,35 @@ def test_a_singular_matrix_is_refused_and_the_next_is_not(solver: str, singular:
             factor.factorise(values_of(broken, indptr, indices))
         factor.factorise(values_of(matrix, indptr, indices))
         np.testing.assert_allclose(matrix @ factor.solve(np.ones(SIZE)), 1.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("solver", ["fronts", "fronts-double", "superlu"])
+def test_definite_is_neither_singular_nor_indefinite(solver: str) -> None:
+    chain = 2.0 * np.eye(SIZE) - np.eye(SIZE, k=1) - np.eye(SIZE, k=-1)
+    loose = chain.copy()
+    loose[5], loose[:, 5] = 0.0, 0.0
+    indptr, indices = pattern_of(chain)
+    factor = make_factor(indptr, indices, solver=solver)
+    for matrix, definite in ((chain, True), (loose, False), (-chain, False), (chain, True)):
+        values = values_of(matrix, indptr, indices)
+        assert factor.factorise_definite(values) is definite
+    with pytest.raises(SimulationError, match="not numbers"):
+        factor.factorise_definite(np.nan * values)
+
+
+@pytest.mark.parametrize("solver", ["fronts", "fronts-double", "superlu"])
+@pytest.mark.parametrize("share", [np.nan, 0.0])
+@pytest.mark.parametrize("call", ["factorise", "factorise_definite"])
+def test_a_refused_matrix_leaves_no_factor_of_the_one_before(
+    solver: str, share: float, call: str
+) -> None:
+    good = values_of(indefinite(0), *pattern_of(indefinite(0)))
+    factor = make_factor(*pattern_of(indefinite(0)), solver=solver)
+    factor.factorise(good)
+    with contextlib.suppress(SimulationError):
+        getattr(factor, call)(share * good)
+    with pytest.raises(SimulationError, match="factorise first"):
+        factor.solve(np.ones(SIZE))
 
 
 def test_a_matrix_that_is_not_there_cannot_be_solved(solver: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -81,6 +82,17 @@ def test_fit_finds_the_range_of_a_planted_specimen(
     assert specimen.name == "one"
 
 
+@pytest.mark.parametrize("asperity_m", [80e-6, 47e-6])
+def test_a_fit_stays_within_the_limits_of_a_specimen(
+    sensor: ElectrodeModel, states: tuple[list[Gap], Gap], asperity_m: float
+) -> None:
+    """Electrodes that hardly fall ask for a film under pressure as thick as it may be."""
+    pressed, rest = states
+    start = replace(SpecimenParameters(), floor_m=45e-6, asperity_m=asperity_m)
+    specimen, _ = fit_specimen(sensor.with_specimen(start), pressed[:2], rest, (-0.02, 0.1))
+    assert specimen.floor_m == pytest.approx(min(50e-6, asperity_m), rel=0.01)
+
+
 def test_thinner_films_at_the_sides_rest_lower_and_rise_more(
     sensor: ElectrodeModel, states: tuple[list[Gap], Gap]
 ) -> None:
@@ -129,7 +141,24 @@ def test_population_round_trip_and_refusals(tmp_path: Path) -> None:
     cases: list[tuple[Callable[[Any], Any], str]] = [
         (lambda c: c.update(schema="other/1"), "schema"),
         (lambda c: c["members"][0]["unit"].update(sigma_s_m=-1.0), "sigma_s_m"),
-        (lambda c: c["members"][1].pop("overtravel_m"), "overtravel_m"),
+        (
+            lambda c: c["members"][1].pop("overtravel_m"),
+            "three.json: member 2 lacks 'overtravel_m'",
+        ),
+        (lambda c: c["members"][1].update(overtravel_m="1"), "member 2: overtravel_m = '1'"),
+        (
+            lambda c: c["members"][0]["wanted"].update(indenters="sphere_"),
+            "three.json: member 1: wanted.indenters = 'sphere_' is not a list of names",
+        ),
+        (lambda c: c["members"][2]["wanted"].update(low="x"), "member 3: wanted.low = 'x'"),
+        (lambda c: c["members"][2]["wanted"].pop("high"), "member 3 lacks 'high'"),
+        (lambda c: c["members"][0].update(wanted={}), "member 1 lacks 'indenters'"),
+        (lambda c: c["members"][0]["found"].update(low=None), "member 1: found.low = None"),
+        (lambda c: c["members"][0].update(found="none"), "member 1: found = 'none' is not a JSON"),
+        (lambda c: c["members"][0].update(wanted=[1]), "member 1: wanted = [1] is not a JSON"),
+        (lambda c: c["members"][1].update(overtravel_m=10**400), "member 2: "),
+        (lambda c: c["members"].append(1), "member 4: "),
+        (lambda c: c.pop("members"), "members is not a list"),
         (lambda c: c["members"].append(c["members"][0]), "biotac-1"),
         (lambda c: c.update(members=[]), "nothing"),
     ]
@@ -137,11 +166,11 @@ def test_population_round_trip_and_refusals(tmp_path: Path) -> None:
         broken = json.loads(json.dumps(content))
         break_it(broken)
         path.write_text(json.dumps(broken), encoding="utf-8")
-        with pytest.raises(ConfigError, match=word):
+        with pytest.raises(ConfigError, match=re.escape(word)):
             read_population(path)
     for value, problem, remedy in (
-        ({"sigma_s_m": -1.0}, "a member: sigma_s_m = -1", "SI"),
-        ({"colour": 1.0}, "a member: unknown key 'colour' of a specimen", "asperity_m, "),
+        ({"sigma_s_m": -1.0}, "member 1: sigma_s_m = -1", "SI"),
+        ({"colour": 1.0}, "member 1: unknown key 'colour' of a specimen", "asperity_m, "),
     ):
         broken = json.loads(json.dumps(content))
         broken["members"][0]["unit"] |= value

@@ -23,9 +23,10 @@ from palpate_fem.electrodes.specimen import SENSING, SpecimenParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.solver import Fingertip
 from palpate_fem.mesh.parametric import biotac
-from palpate_fem.population.explain import ANGLE_SD_RAD, TouchExplainer, TouchPrior
+from palpate_fem.population.explain import ANGLE_SD_RAD, SPREAD, TouchExplainer, TouchPrior
+from palpate_fem.population.fitting import deep_states
 from palpate_fem.population.members import read_population
-from palpate_fem.population.press_library import PressLibrary
+from palpate_fem.population.press_library import PressLibrary, read_library
 from palpate_fem.population.responses import Population
 from palpate_fem.population.sensor_fit import fit_sensor
 from palpate_fem.population.touches import (
@@ -143,7 +144,7 @@ def test_a_planted_sensor_is_found_and_its_later_touches_are_told(bench: Bench) 
     fit = fit_sensor(
         bench.model, bench.library, bench.touches, on_round=lambda _, spread: rounds.append(spread)
     )
-    assert rounds[-1] < 0.5 * rounds[0]
+    assert rounds[-1] < min(rounds[0], 4 * NOISE_COUNTS)
     assert fit.learned is not None
     assert fit.learned.warmth == pytest.approx(0.057, abs=0.03)
     for name, before in misses(nominal).items():
@@ -152,6 +153,61 @@ def test_a_planted_sensor_is_found_and_its_later_touches_are_told(bench: Bench) 
     assert by_touches > 0.97
     assert by_touches > explained(bench, rest.specimen) + 0.02
     assert by_touches > explained(bench, nominal) + 0.5
+
+
+def touch_of(bench: Bench) -> SensorTouches:
+    """The first press of the library at 3 N, as the planted sensor reads it."""
+    sensor = bench.model.with_specimen(PLANTED)
+    counts = sensor.of_gap(bench.library.gaps[1]).counts
+    return SensorTouches("planted", bench.touches.rest, counts[None], bench.library.force[1:2])
+
+
+def first_press(bench: Bench, times: int = 1) -> PressLibrary:
+    """The library's first press alone, so many times."""
+    library, steps = bench.library, len(STEPS_N)
+    states = np.tile(np.arange(steps), times)
+    return PressLibrary(
+        library.rest,
+        [library.gaps[state] for state in states],
+        library.force[states],
+        library.place[states],
+        np.repeat(np.arange(times), steps),
+    )
+
+
+def test_a_touch_counts_however_many_presses_it_may_have_been(bench: Bench) -> None:
+    touch = touch_of(bench)
+    rest = fit_sensor(bench.model, first_press(bench), touch.some(slice(0, 0)))
+    once, often = (
+        fit_sensor(bench.model, first_press(bench, times), touch, rounds=1) for times in (1, 60)
+    )
+    assert once.specimen.side_closing_m > 1.2 * rest.specimen.side_closing_m
+    for name in ("sigma_s_m", "side_closing_m", "clamp_closing", "core_offset_m"):
+        value = getattr(once.specimen, name)
+        assert getattr(often.specimen, name) == pytest.approx(value, rel=1e-3), name
+
+
+def test_a_fit_does_not_end_before_the_touches_were_fitted(bench: Bench) -> None:
+    """Not even where electrodes deviate from the start by as much as is assumed of unknown ones."""
+    library, touch = first_press(bench), touch_of(bench)
+    rest = fit_sensor(bench.model, library, touch.some(slice(0, 0)))
+    explainer = TouchExplainer(bench.model.with_specimen(rest.specimen), library)
+    by_force = explainer.explain(touch, TouchPrior(), given=np.zeros(SENSING, bool))
+    expected = touch.rest + by_force.tared
+    off = np.where(np.arange(SENSING) % 2, 1.0, -1.0)
+    # What is left is linear in the deviation.
+    left = explainer.explain(replace(touch, counts=expected + off), TouchPrior()).left
+    fit = fit_sensor(bench.model, library, replace(touch, counts=expected + SPREAD / left * off))
+    assert fit.specimen != rest.specimen
+
+
+def test_what_touches_teach_is_told_of_the_specimen_that_is_returned(bench: Bench) -> None:
+    fit = fit_sensor(bench.model, bench.library, bench.touches, rounds=1)
+    assert fit.learned is not None
+    explainer = TouchExplainer(bench.model.with_specimen(fit.specimen), bench.library)
+    own = explainer.learn(bench.touches).learned
+    assert fit.learned.spread == pytest.approx(own.spread, rel=0.1)
+    assert fit.learned.warmth == pytest.approx(own.warmth, abs=0.02)
 
 
 def test_without_touches_only_the_rest_is_fitted(bench: Bench) -> None:
@@ -209,6 +265,17 @@ def test_candidates_have_the_measured_size_of_force(bench: Bench) -> None:
     np.testing.assert_allclose(size[there], wanted[there], rtol=1e-9)
 
 
+def test_candidates_of_a_press_that_dips_have_the_measured_size_too(bench: Bench) -> None:
+    sizes = np.array([2.0, 1.0, 3.0, 2.5, 4.0, 1.0])
+    force = sizes[:, None] * [0.0, 0.0, 1.0]
+    gaps, press = [bench.library.rest] * len(sizes), np.zeros(len(sizes), np.int64)
+    library = PressLibrary(bench.library.rest, gaps, force, np.zeros((len(sizes), 3)), press)
+    wanted = np.array([2.0, 2.2, 3.0, 3.5, 4.0])
+    found = library.candidates(wanted[:, None] * [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(found.at(library.force)[:, 0, 2], wanted)
+    assert ((found.share >= 0) & (found.share <= 1)).all()
+
+
 def recording() -> tuple[Floats, Floats]:
     """Three holds; the second moves too little to be another touch, and one is too short."""
     rng = np.random.default_rng(0)
@@ -253,6 +320,7 @@ def write_recording(
     path: Path,
     *,
     rows_of: tuple[Floats, Floats, Floats] | None = None,
+    group: Floats | None = None,
     leave_out: str = "",
     names: tuple[str, ...] = ("mine",),
 ) -> Path:
@@ -260,10 +328,12 @@ def write_recording(
     rows = len(counts)
     columns: dict[str, tuple[str, Any]] = {
         "electrodes": ("counts", counts.astype(np.uint16)),
-        "baseline": ("counts", np.tile(rest, (rows, 1)).astype(np.float32)),
+        "baseline": ("counts", np.broadcast_to(rest, counts.shape).astype(np.float32)),
         "force": ("N", force.astype(np.float32)),
         "sensor": ("1", np.zeros(rows, np.int32)),
     }
+    if group is not None:
+        columns["group"] = ("1", group.astype(np.int32))
     with h5py.File(path, "w") as file:
         file.attrs.update({**FEATURES.facts, "sensor_names": list(names)})
         for name, (unit, values) in columns.items():
@@ -302,8 +372,51 @@ def test_a_recording_is_read_or_refused(tmp_path: Path) -> None:
             call()
 
 
+def test_touches_are_tared_by_the_tare_that_was_in_force(tmp_path: Path) -> None:
+    """The same dents, with one electrode near the converter's end, after each of two tares."""
+    rest = np.repeat([2700.0, 2500.0], 120)[:, None] * np.ones(SENSING)
+    counts = rest + np.tile(np.repeat([-400.0, 600.0], 60), 2)[:, None]
+    counts[:, 0] = np.tile(np.repeat([4000.0, 3000.0], 60), 2)
+    force = np.tile([0.0, 0.0, 4.0], (len(counts), 1))
+    touches = read_touches(write_recording(tmp_path / "a.h5", rows_of=(rest, counts, force)))
+    np.testing.assert_array_equal(touches.tared[:, 1], [-400, 600, -400, 600])
+    np.testing.assert_array_equal(touches.some(slice(2, 4)).tared[:, 1], [-400, 600])
+    np.testing.assert_array_equal(touches.counts[:, 0], [4000, 3000, 4000, 3000])
+    np.testing.assert_array_equal(touches.rest, np.full(SENSING, 2700.0))
+    # An electrode at its end is refused, even if the first tare was higher.
+    counts[180:, 0] = 0.0
+    with pytest.raises(DatasetError, match="counts is from 0"):
+        read_touches(write_recording(tmp_path / "b.h5", rows_of=(rest, counts, force)))
+    with pytest.raises(DatasetError, match="240 rows of counts, 3 of baseline"):
+        touches_of("mine", REST, counts, force, baseline=rest[:3])
+    with pytest.raises(DatasetError, match="baseline is not finite"):
+        touches_of("mine", REST, counts, force, baseline=np.nan * rest)
+
+
+def test_a_touch_is_of_one_press(tmp_path: Path) -> None:
+    """Two presses at which the electrodes read the same, with different forces."""
+    counts = np.full((120, SENSING), 2000.0)
+    force = np.repeat([[0.0, 0.0, 4.0], [3.0, 0.0, 0.0]], 60, axis=0)
+    rows_of = REST, counts, force
+    apart = write_recording(tmp_path / "apart.h5", rows_of=rows_of, group=np.repeat([0.0, 1.0], 60))
+    np.testing.assert_array_equal(read_touches(apart).force, force[[0, 60]])
+    assert len(read_touches(write_recording(tmp_path / "one.h5", rows_of=rows_of))) == 1
+
+
 def test_the_digest_is_of_all_columns_of_a_data_set() -> None:
     assert tuple(FEATURE_COLUMNS) == DIGESTED
+
+
+def kept_for_counts_alone(path: Path, sensor: ElectrodeModel) -> None:
+    """Gaps of a store are kept by the thousand, so without what derivatives by the skin need."""
+    store = SimulationStore.open(path)
+    for gaps in (
+        read_library(store, sensor).gaps,
+        [gap for deep in deep_states(store, sensor, lambda _: 2e-3) for gap in deep.gaps],
+    ):
+        some = [gap for gap in gaps if gap is not None and gap.pressure.any()]
+        assert some
+        assert all(gap.contact is None for gap in some)
 
 
 def test_the_command_writes_a_population_that_the_twin_takes(tmp_path: Path) -> None:
@@ -324,6 +437,7 @@ def test_the_command_writes_a_population_that_the_twin_takes(tmp_path: Path) -> 
             gap = sensor.finder.of_step(tip.nodes, step)
             counts.append(sensor.of_gap(gap).counts)
             force.append(step.force)
+    kept_for_counts_alone(tmp_path / "plate.sim", sensor)
     rest = sensor.respond(tip.nodes).counts
     rows_of = rest, np.array(counts), np.array(force)
     recorded = write_recording(tmp_path / "real.h5", rows_of=rows_of)

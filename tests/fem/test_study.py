@@ -57,6 +57,16 @@ def test_rows_tell_what_refinement_changed(rows: list[study.StudyRow]) -> None:
     assert coarse.plain()["force_change"] is None
 
 
+def test_on_the_same_mesh_nodes_are_compared_without_interpolation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ball = replace(study.PRESSES["sphere_medium"], depth_m=0.3e-3)
+    monkeypatch.setattr(study, "PRESSES", {"sphere_medium": ball})
+    first, again = study.step_study(edge_m=1.4e-3, steps=(2, 2))
+    assert again.force_n == first.force_n
+    assert again.largest_change_m == 0.0
+
+
 def test_a_study_is_drawn(rows: list[study.StudyRow], tmp_path: Path) -> None:
     plot_study(rows, tmp_path / "study.png")
     assert (tmp_path / "study.png").read_bytes().startswith(b"\x89PNG")

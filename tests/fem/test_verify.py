@@ -11,7 +11,7 @@ import pytest
 from palpate.errors import SimulationError
 from palpate_fem import verify
 from palpate_fem.mechanics.system import EquilibriumSystem
-from palpate_fem.verify import closed_forms
+from palpate_fem.verify import closed_forms, conservation
 from palpate_fem.verify.check import (
     Measurement,
     MissingDataError,
@@ -73,6 +73,23 @@ def test_no_solution_is_a_failure_with_a_reason() -> None:
     assert not check.passed
     assert math.isnan(check.value)
     assert "inside out" in check.note
+
+
+@pytest.mark.parametrize(
+    ("name", "residuals"),
+    [
+        ("newton/order in contact at nodes", [1e-3, 1e-9]),
+        ("newton/order in contact at nodes", []),
+        ("newton/left by an iteration in mortar contact", [0.5]),
+    ],
+)
+def test_too_few_iterations_to_measure_are_a_failure(
+    name: str, residuals: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conservation, "_pressed_in_steps", lambda **_: residuals)
+    (found,) = verify.run(only=name)
+    assert math.isnan(found.value)
+    assert not found.passed
 
 
 def test_shared_data_lie_beside_the_checkout() -> None:

@@ -101,7 +101,7 @@ def _show_checks(checks: list[VerificationCheck]) -> None:
             check.name,
             *("" if check.skipped else f"{x:.6g}" for x in (check.value, check.reference)),
             check.unit,
-            f"{check.tolerance:.1g}",
+            f"{check.tolerance:.2g}",
             _verdict(check),
             escape(check.note),
         )

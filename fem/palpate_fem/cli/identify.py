@@ -512,5 +512,6 @@ def _against(member: Member, key: str) -> str:
     """What was found and, in brackets, published; a drawn specimen has neither."""
     if member.published is None:
         return "-"
-    found, published = member.found[key], getattr(member.published, key)
-    return f"{found:.1f} ({published})" if key == "max_force_n" else f"{found:.3f} ({published})"
+    form = ".1f" if key == "max_force_n" else ".3f"
+    found = format(member.found[key], form) if key in member.found else "-"
+    return f"{found} ({getattr(member.published, key)})"

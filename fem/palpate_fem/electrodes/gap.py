@@ -6,7 +6,7 @@ the film in that gap: where skin and core touch, asperities of the skin hold a r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import no_type_check
 
 import numpy as np
@@ -159,7 +159,7 @@ class Gap:
         pressure: Of the core on the skin there, above the fluid's [Pa], shape (N,).
         normals: The core's normals, shape (N, 3).
         contact: Pressures of the skin's nodes, of which `pressure` is interpolated; None = no
-            contact.
+            contact, or a gap `for_counts`.
     """
 
     gap: Floats
@@ -169,6 +169,10 @@ class Gap:
     pressure: Floats
     normals: Floats
     contact: CorePressure | None = None
+
+    def for_counts(self) -> Gap:
+        """Without what only derivatives by the skin need: 80 bytes for each of its nodes."""
+        return replace(self, contact=None)
 
     def to_skin(self, by_gap: Floats, count: int, by_pressure: Floats | None = None) -> Floats:
         """Transpose of the derivative: of a scalar by gaps to the same by nodal positions.

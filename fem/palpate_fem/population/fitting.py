@@ -72,9 +72,10 @@ def fit_specimen(
     low, high = _bounds(start)
 
     def specimen_at(scaled: Floats) -> SpecimenParameters:
-        at = np.clip(centre + scaled * spread, low, high)
-        values = dict(zip(FITTED, np.exp(at[:-1]).tolist(), strict=True))
-        return replace(start, **values, side_closing_m=float(at[-1]))
+        at = centre + scaled * spread
+        # Clipped last: the exponential of a limit's logarithm may lie beyond the limit.
+        values = np.clip([*np.exp(at[:-1]), at[-1]], low, high).tolist()
+        return replace(start, **dict(zip((*FITTED, "side_closing_m"), values, strict=True)))
 
     scaled = np.zeros(len(centre))
     chosen: set[int] = set()
@@ -115,9 +116,9 @@ def _extreme(tared: Floats) -> set[int]:
 
 
 def _bounds(specimen: SpecimenParameters) -> tuple[Floats, Floats]:
-    ends = [np.log(LIMITS[key]) for key in FITTED] + [np.array(LIMITS["side_closing_m"])]
-    low, high = np.array(ends).T
-    high[FITTED.index("floor_m")] = np.log(specimen.asperity_m)
+    low, high = np.array([LIMITS[key] for key in (*FITTED, "side_closing_m")]).T
+    floor = FITTED.index("floor_m")
+    high[floor] = min(high[floor], specimen.asperity_m)
     return low, high
 
 
@@ -182,7 +183,7 @@ def deep_states(
             (),
         )
         at = [deep.deepest(extra) for extra in OVERTRAVELS_M]
-        gap_of = {k: sensor.finder.of_step(nodes, steps[k]) for k in set(at) if k >= 0}
+        gap_of = {k: sensor.finder.of_step(nodes, steps[k]).for_counts() for k in set(at) if k >= 0}
         found.append(replace(deep, gaps=tuple(gap_of.get(k) for k in at)))
         if on_trajectory is not None:
             on_trajectory()

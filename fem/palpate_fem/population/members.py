@@ -174,14 +174,10 @@ def read_population(path: Path | None = None) -> tuple[Member, ...]:
         raise ConfigError(f"{where} cannot be read: {error}", remedy=_REMEDY) from error
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise ConfigError(f"{where} does not have the schema {SCHEMA}", remedy=_REMEDY)
-    try:
-        members = tuple(_member(entry) for entry in content["members"])
-    except ConfigError as error:
-        raise ConfigError(f"{where}: a member: {error.problem}", remedy=error.remedy) from error
-    except KeyError as error:
-        raise ConfigError(f"{where}: a member lacks {error}", remedy=_REMEDY) from error
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{where}: a member: {error}", remedy=_REMEDY) from error
+    entries = content.get("members")
+    if not isinstance(entries, list):
+        raise ConfigError(f"{where}: members is not a list", remedy=_REMEDY)
+    members = tuple(_member(entry, f"{where}: member {k}") for k, entry in enumerate(entries, 1))
     names = [member.specimen.name for member in members]
     if not names or len(set(names)) != len(names):
         raise ConfigError(
@@ -191,11 +187,43 @@ def read_population(path: Path | None = None) -> tuple[Member, ...]:
     return members
 
 
-def _member(entry: dict[str, Any]) -> Member:
-    wanted = entry["wanted"]
-    published = wanted and PublishedRange(**{**wanted, "indenters": tuple(wanted["indenters"])})
-    overtravel = float(entry["overtravel_m"])
-    if not math.isfinite(overtravel):
-        raise ValueError(f"overtravel_m = {overtravel}")
-    specimen = SpecimenParameters.from_json(json.dumps(entry["unit"]))
-    return Member(specimen, published, overtravel, dict(entry["found"]))
+def _member(entry: Any, where: str) -> Member:
+    try:
+        return Member(
+            SpecimenParameters.from_json(json.dumps(entry["unit"])),
+            None if entry["wanted"] is None else _published(_object("wanted", entry["wanted"])),
+            _number("overtravel_m", entry["overtravel_m"]),
+            {
+                key: _number(f"found.{key}", one)
+                for key, one in _object("found", entry["found"]).items()
+            },
+        )
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error.problem}", remedy=error.remedy) from error
+    except KeyError as error:
+        raise ConfigError(f"{where} lacks {error}", remedy=_REMEDY) from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ConfigError(f"{where}: {error}", remedy=_REMEDY) from error
+
+
+def _object(label: str, value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ConfigError(f"{label} = {value!r} is not a JSON object", remedy=_REMEDY)
+    return value
+
+
+def _published(wanted: dict[str, Any]) -> PublishedRange:
+    indenters = wanted["indenters"]
+    if not (isinstance(indenters, list) and all(isinstance(one, str) for one in indenters)):
+        raise ConfigError(
+            f"wanted.indenters = {indenters!r} is not a list of names",
+            remedy='give a list, such as ["sphere_"]; an empty one means all',
+        )
+    numbers = {key: _number(f"wanted.{key}", wanted[key]) for key in ("low", "high", "max_force_n")}
+    return PublishedRange(**{**wanted, **numbers, "indenters": tuple(indenters)})
+
+
+def _number(label: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ConfigError(f"{label} = {value!r} is not a finite number", remedy=_REMEDY)
+    return float(value)

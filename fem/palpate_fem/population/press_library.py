@@ -115,8 +115,9 @@ class PressLibrary:
                     continue
                 k = max(int(np.searchsorted(rising, one)), 1)
                 low[n, j], high[n, j] = steps[k - 1], steps[k]
-                step = rising[k] - rising[k - 1]
-                share[n, j] = (one - rising[k - 1]) / step if step > 0 else 1.0
+                # The step before may be lighter than an earlier one, but not the step after.
+                before, after = size[steps[k - 1]], size[steps[k]]
+                share[n, j] = (one - before) / (after - before) if after != before else 0.0
         there = low >= 0
         if not there.any(axis=1).all():
             lost = wanted[~there.any(axis=1)]
@@ -160,7 +161,7 @@ def read_library(
         trajectory = store.trajectory(name)
         steps = trajectory.steps[: clear_steps(trajectory, fingertip.mesh.fixed)]
         some = [step for step in steps if np.linalg.norm(step.force) >= LEAST_N]
-        gaps += [sensor.finder.of_step(nodes, step) for step in some]
+        gaps += [sensor.finder.of_step(nodes, step).for_counts() for step in some]
         force += [step.force for step in some]
         place += [step.centre_of_pressure for step in some]
         press += [number] * len(some)

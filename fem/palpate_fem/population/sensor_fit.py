@@ -55,8 +55,9 @@ OnRound = Callable[[int, float], None]
 REST_SPREAD = 50.0
 """Deviation of counts at rest [counts], if that of touches is not smaller: what fits leave of real
 ones (docs/results/twin/units.md)."""
-KEPT, LEAST_PROBABILITY = 4, 0.02
-"""Presses for each touch that a fit of the specimen uses: the most probable, and how probable."""
+KEPT, LEAST_SHARE = 4, 0.02
+"""Presses for each touch that a fit of the specimen uses: how many at most, and how probable each
+must be over the most probable one. Probabilities themselves fall with the size of the library."""
 
 MOST_ANGLE_RAD = 3 * ANGLE_SD_RAD
 """Between the forces of touches and those of the nearest presses, median: those of a real sensor
@@ -198,23 +199,29 @@ def fit_sensor(
             remedy="give the force on the sensor, not by it, in the sensor frame; or simulate "
             "presses from that side",
         )
-    start = np.zeros(len(PRIORS) + SENSING)
-    at = _fitted(sensor, library, touches, start, [], REST_SPREAD)
-    prior, done = TouchPrior(), 0
+    at = _fitted(sensor, library, touches, np.zeros(len(PRIORS) + SENSING), [], REST_SPREAD)
+
+    def explained(places: Candidates, prior: TouchPrior) -> Explanation:
+        model = sensor.with_specimen(specimen_at(at, sensor.specimen))
+        return TouchExplainer(model, library).explain(touches, prior, places=places)
+
+    learned: TouchPrior | None = None
+    done = 0
     if places is not None:
+        found = explained(places, TouchPrior())
         for done in range(1, rounds + 1):
-            model = sensor.with_specimen(specimen_at(at, sensor.specimen))
-            found = TouchExplainer(model, library).explain(touches, prior, places=places)
-            before, prior = prior, found.learned
+            before = found.learned
+            at = _fitted(sensor, library, touches, at, _pairs(places, found), before.spread)
+            found = explained(places, before)
             if on_round is not None:
-                on_round(done, prior.spread)
-            if abs(prior.spread / before.spread - 1) < 0.01:
+                on_round(done, found.learned.spread)
+            if abs(found.learned.spread / before.spread - 1) < 0.01:
                 break
-            at = _fitted(sensor, library, touches, at, _pairs(places, found), prior.spread)
+        learned = found.learned
     specimen = replace(specimen_at(at, sensor.specimen), name=touches.name)
     rest = sensor.with_specimen(specimen).of_gap(library.rest).counts
     error = float(np.sqrt(np.mean((rest - touches.rest) ** 2)))
-    return SensorFit(specimen, error, prior if len(touches) else None, done, angle_rad)
+    return SensorFit(specimen, error, learned, done, angle_rad)
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +240,7 @@ def _pairs(places: Candidates, found: Explanation) -> list[_Pair]:
     pairs = []
     for n, row in enumerate(found.probability):
         best = np.argsort(-row)[:KEPT]
-        best = best[row[best] > LEAST_PROBABILITY]
+        best = best[row[best] > LEAST_SHARE * row[best[0]]]
         total = float(row[best].sum())
         pairs += [
             _Pair(

@@ -8,6 +8,7 @@ the sensor's slow response and of the lag between the two instruments.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,8 @@ class SensorTouches:
         rest: Counts of the untouched sensor, shape (19,).
         counts: Of each touch, raw, shape (N, 19).
         force: On the sensor [N], sensor frame, shape (N, 3).
+        baseline: Counts of the untouched sensor in force at each touch, shape (N, 19): it may have
+            been tared again; None = at all of them the rest.
 
     Raises:
         DatasetError: Shapes do not fit together, a value is not finite or no count, there is no
@@ -61,21 +64,22 @@ class SensorTouches:
     rest: Floats
     counts: Floats
     force: Floats
+    baseline: Floats | None = None
 
     def __post_init__(self) -> None:
-        for label, shape, wanted in (
-            ("rest", self.rest.shape, (SENSING,)),
-            ("counts", self.counts.shape, (len(self.counts), SENSING)),
-            ("force", self.force.shape, (len(self.counts), 3)),
-        ):
-            if shape != wanted:
+        count = len(self.counts)
+        raw = {"rest": (self.rest, (SENSING,)), "counts": (self.counts, (count, SENSING))}
+        if self.baseline is not None:
+            raw["baseline"] = (self.baseline, (count, SENSING))
+        for label, (values, wanted) in {**raw, "force": (self.force, (count, 3))}.items():
+            if values.shape != wanted:
                 raise DatasetError(
-                    f"{self.name}: {label} has shape {shape}, expected {wanted}", remedy=_REMEDY
+                    f"{self.name}: {label} has shape {values.shape}, expected {wanted}",
+                    remedy=_REMEDY,
                 )
-        for label, values in (("rest", self.rest), ("counts", self.counts), ("force", self.force)):
             if not np.isfinite(values).all():
                 raise DatasetError(f"{self.name}: {label} is not finite", remedy=_REMEDY)
-        for label, values in (("rest", self.rest), ("counts", self.counts)):
+        for label, (values, _) in raw.items():
             if values.size and not (0 < values.min() and values.max() < FULL_SCALE):
                 raise DatasetError(
                     f"{self.name}: {label} is from {values.min():g} to {values.max():g}, not within"
@@ -94,12 +98,15 @@ class SensorTouches:
 
     @property
     def tared(self) -> Floats:
-        """Counts minus those at rest, shape (N, 19)."""
-        return self.counts - self.rest
+        """Counts minus the untouched ones, shape (N, 19)."""
+        return self.counts - (self.rest if self.baseline is None else self.baseline)
 
     def some(self, chosen: slice | NDArray[np.integer[Any]]) -> SensorTouches:
         """Some of the touches."""
-        return SensorTouches(self.name, self.rest, self.counts[chosen], self.force[chosen])
+        baseline = None if self.baseline is None else self.baseline[chosen]
+        return SensorTouches(
+            self.name, self.rest, self.counts[chosen], self.force[chosen], baseline
+        )
 
 
 def held(counts: Floats, *, rows: int = HELD_ROWS, still: float = STILL_COUNTS) -> list[slice]:
@@ -143,6 +150,8 @@ def touches_of(
     counts: Floats,
     force: Floats,
     *,
+    baseline: Floats | None = None,
+    group: NDArray[np.integer[Any]] | None = None,
     rows: int = HELD_ROWS,
     still: float = STILL_COUNTS,
 ) -> SensorTouches:
@@ -153,6 +162,9 @@ def touches_of(
         rest: Counts of the untouched sensor, shape (19,).
         counts: Raw, in order of time, shape (T, 19).
         force: On the sensor [N], shape (T, 3).
+        baseline: Untouched counts in force at each row, shape (T, 19); None = the rest.
+        group: Recording or press of each row, shape (T,): a touch is within one; None = all rows
+            are of one.
         rows: Shortest stretch.
         still: See `STILL_COUNTS`.
 
@@ -164,25 +176,37 @@ def touches_of(
             f"{name}: touches of {rows} rows that move by {still:g} counts",
             remedy="give at least one row and more than 0 counts",
         )
-    if len(counts) != len(force):
-        raise DatasetError(
-            f"{name}: {len(counts)} rows of counts, {len(force)} of force", remedy=_REMEDY
-        )
+    others: dict[str, NDArray[Any] | None] = {"force": force, "baseline": baseline, "group": group}
+    for label, values in others.items():
+        if values is not None and len(values) != len(counts):
+            raise DatasetError(
+                f"{name}: {len(counts)} rows of counts, {len(values)} of {label}", remedy=_REMEDY
+            )
     if not (np.isfinite(counts).all() and np.isfinite(force).all()):
         raise DatasetError(f"{name}: counts or force are not finite", remedy=_REMEDY)
-    stretches = held(np.asarray(counts, np.float64), rows=rows, still=still)
-    means = [(counts[one].mean(axis=0), force[one].mean(axis=0)) for one in stretches]
-    kept = [pair for pair in means if np.linalg.norm(pair[1]) >= LEAST_N]
+    tared = np.asarray(counts if baseline is None else counts - baseline, np.float64)
+    cuts: list[int] = [] if group is None else (np.flatnonzero(np.diff(group)) + 1).tolist()
+    stretches = [
+        slice(start + one.start, start + one.stop)
+        for start, end in pairwise([0, *cuts, len(counts)])
+        for one in held(tared[start:end], rows=rows, still=still)
+    ]
+    kept = [one for one in stretches if np.linalg.norm(force[one].mean(axis=0)) >= LEAST_N]
     if not kept:
         raise DatasetError(
             f"{name}: no touch of {LEAST_N} N was held for {rows} rows",
             remedy="hold each touch for half a second, or ask for fewer rows",
         )
+
+    def means(values: Floats) -> Floats:
+        return np.array([values[one].mean(axis=0) for one in kept], np.float64)
+
     return SensorTouches(
         name,
         np.asarray(rest, np.float64),
-        np.array([one for one, _ in kept], np.float64),
-        np.array([one for _, one in kept], np.float64),
+        means(counts),
+        means(force),
+        None if baseline is None else means(baseline),
     )
 
 
@@ -190,7 +214,8 @@ def read_touches(path: Path, *, sensor: str = "", rows: int = HELD_ROWS) -> Sens
     """Touches of one sensor of a data set (schema ``palpate.features``).
 
     Args:
-        path: Made by ``palpate data ingest-...``: counts, untouched counts, forces.
+        path: Made by ``palpate data ingest-...``: counts, untouched counts in force at each row,
+            forces, and which rows are of one recording or press. The rest is that of the first row.
         sensor: Its name; empty = the only one.
         rows: Shortest stretch that counts as held.
 
@@ -201,6 +226,7 @@ def read_touches(path: Path, *, sensor: str = "", rows: int = HELD_ROWS) -> Sens
     with opened(path, extra="fem", missing="make it: palpate data ingest-record") as file:
         FEATURES.check(path, file)
         columns = {name: read_array(path, file, name, unit) for name, unit in COLUMNS.items()}
+        group = read_array(path, file, "group", "1") if "group" in file else None
         names = [text(name) for name in file.attrs.get("sensor_names", ())]
         if stated := text(file.attrs.get("content_sha256", "")):
             there = {name: file[name].attrs.get("unit", "") for name in DIGESTED if name in file}
@@ -216,10 +242,13 @@ def read_touches(path: Path, *, sensor: str = "", rows: int = HELD_ROWS) -> Sens
     mine = columns["sensor"] == (names.index(sensor) if sensor else 0)
     if not mine.any():
         raise DatasetError(f"{path}: no row of {sensor or names[0]}", remedy=_REMEDY)
+    baseline = columns["baseline"][mine].astype(np.float64)
     return touches_of(
         sensor or names[0],
-        columns["baseline"][mine].astype(np.float64).mean(axis=0),
+        baseline[0],
         columns["electrodes"][mine].astype(np.float64),
         columns["force"][mine].astype(np.float64),
+        baseline=baseline,
+        group=None if group is None else group[mine],
         rows=rows,
     )

@@ -27,12 +27,19 @@ class SparseFactor(Protocol):
     name: str
 
     def factorise(self, values: Floats) -> None:
-        """Factorise the matrix with these values of its upper triangle."""
+        """Factorise the matrix with these values of its upper triangle.
+
+        Raises:
+            SimulationError: It is singular or not finite; there is then no factor.
+        """
 
     def factorise_definite(self, values: Floats) -> bool:
         """Factorise it only if all its eigenvalues are clearly positive; returns whether they are.
 
         Cheaper than `factorise` and `negative` where they are not: it ends at the first sign of it.
+
+        Raises:
+            SimulationError: It is not finite; there is then no factor.
         """
 
     def solve(self, right: Floats) -> Floats:
@@ -83,9 +90,9 @@ class Multifrontal:
         self._current: FrontalFactor | None = None
 
     def factorise(self, values: Floats) -> None:
-        """See `SparseFactor`; singular or non-finite matrices raise SimulationError."""
-        check_finite(values)
+        """See `SparseFactor`."""
         self._current = None
+        check_finite(values)
         if self._single is not None:
             try:
                 self._single.factorise(values)
@@ -110,10 +117,9 @@ class Multifrontal:
     def factorise_definite(self, values: Floats) -> bool:
         """See `SparseFactor`."""
         if self._single is None:
-            self.factorise(values)
-            return self.negative == 0
-        check_finite(values)
+            return _is_definite(self, values)
         self._current = None
+        check_finite(values)
         try:
             self._single.factorise(values)
         except UnsafePivotError:
@@ -168,6 +174,7 @@ class SuperLu:
 
     def factorise(self, values: Floats) -> None:
         """See `SparseFactor`."""
+        self._factor = None
         check_finite(values)
         self._full.data = values[self._gather]
         try:
@@ -184,8 +191,7 @@ class SuperLu:
 
     def factorise_definite(self, values: Floats) -> bool:
         """See `SparseFactor`."""
-        self.factorise(values)
-        return self.negative == 0
+        return _is_definite(self, values)
 
     def solve(self, right: Floats) -> Floats:
         """See `SparseFactor`."""
@@ -197,6 +203,16 @@ class SuperLu:
     def negative(self) -> int:
         """See `SparseFactor`; exact while SuperLU keeps to the diagonal, which it prefers."""
         return 0 if self._factor is None else int((self._factor.U.diagonal() < 0.0).sum())
+
+
+def _is_definite(factor: SparseFactor, values: Floats) -> bool:
+    """By the whole factor: neither singular nor with a negative eigenvalue."""
+    try:
+        factor.factorise(values)
+    except SimulationError:
+        check_finite(values)
+        return False
+    return factor.negative == 0
 
 
 def check_finite(values: Floats) -> None:

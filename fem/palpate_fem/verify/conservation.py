@@ -8,6 +8,7 @@ loading and unloading: the work equals the stored energy plus the loss by fricti
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -237,7 +238,7 @@ def newton_in_mortar_contact() -> Measurement:
     residuals = _pressed_in_steps(mortar=True)
     last = [(a, b) for a, b in itertools.pairwise(residuals) if a < 1e-2 and b > 1e-13]
     note = " ".join(f"{r:.0e}" for r in residuals)
-    return Measurement(max(b / a for a, b in last), 0.0, note)
+    return Measurement(max((b / a for a, b in last), default=math.nan), 0.0, note)
 
 
 COARSE, FINE, FINEST = 4, 16, 32  # increments for each leg of a cycle

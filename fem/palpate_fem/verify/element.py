@@ -6,6 +6,7 @@ the state, as Newton's method keeps them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -113,8 +114,14 @@ def objectivity() -> Measurement:
 
 
 def order_of(residuals: Sequence[float]) -> float:
-    """Exponent q of r_next ~ r^q from the last three residuals above rounding errors."""
-    a, b, c = [r for r in residuals if r > 1e-12][-3:]
+    """Exponent q of r_next ~ r^q from the last three residuals above rounding errors.
+
+    NaN if there are fewer.
+    """
+    last = [r for r in residuals if r > 1e-12][-3:]
+    if len(last) < 3:
+        return math.nan
+    a, b, c = last
     return float(np.log(c / b) / np.log(b / a))
 
 
