@@ -170,10 +170,14 @@ class SampleTicker:
         self._period_s, self._stop = 1.0 / rate_hz, stop
         self.fast = 0.0
         """Relative excess of its rate, e.g. 2e-4."""
+        self.clock_s = 0.0
+        """Time of the device's own clock at the last tick, since the start [s]: one period a tick,
+        and a pause of this process as well."""
         self._next_s = time.monotonic()
 
     def wait(self) -> float:
         """Wait until the next tick or until ``stop``; when the tick was due [s, monotonic]."""
+        last_s = self._next_s
         self._next_s += self._period_s / (1.0 + self.fast)
         left_s = self._next_s - time.monotonic()
         if left_s > 0.0:
@@ -181,4 +185,5 @@ class SampleTicker:
         elif left_s < -0.5:
             # Shorter delays are caught up by ticks in quick succession, as a device would send.
             self._next_s = time.monotonic()
+        self.clock_s += (self._next_s - last_s) * (1.0 + self.fast)
         return self._next_s

@@ -79,12 +79,12 @@ class RobotEmulator(RoutedEmulator):
         self._tip, self._drift = tip, drift_ppm * 1e-6
         self._late = b""
         self._began_s = 0.0
-        self._begin(0)
+        self._begin(0.0)
 
-    def _begin(self, tick: int) -> None:
+    def _begin(self, clock_s: float) -> None:
         """Start its program."""
         self._run_id = secrets.randbits(64) or 1
-        self._sequence, self._first_tick = 0, tick
+        self._sequence, self._started_s = 0, clock_s
 
     def _join(self) -> None:
         self._session = Session.open(self._link(), station=self.station)
@@ -94,26 +94,24 @@ class RobotEmulator(RoutedEmulator):
         ticker = SampleTicker(self.rate_hz, self._stop)
         self._began_s = time.monotonic()
         set_lead(self._tip, self._began_s)
-        tick = 0
         while not self._stop.is_set():
             ticker.fast = self._drift if self.faulty("clock_drift") else 0.0
             due_s = ticker.wait()
-            tick += 1
-            self._step(tick, due_s - self._began_s)
+            self._step(ticker.clock_s, due_s - self._began_s)
 
-    def _step(self, tick: int, t: float) -> None:
+    def _step(self, clock_s: float, t: float) -> None:
         """One cycle of its loop."""
         if self._gone():
             return
         if self._away:
             self._away = False
-            self._begin(tick)
+            self._begin(clock_s)
         if self.faulty("silence"):
             return
         self._sequence += 1
         if self.faulty("lost"):
             return
-        payload = self._payload(tick, self._tip(self.held(t)))
+        payload = self._payload(clock_s, self._tip(self.held(t)))
         if not self._late and self.faulty("late"):
             self._late = payload
             return
@@ -123,8 +121,8 @@ class RobotEmulator(RoutedEmulator):
         if self.faulty("repeated"):
             self._tell(payload)
 
-    def _payload(self, tick: int, tip: Pose) -> bytes:
-        time_ns = _BACK_NS + round(1e9 * (tick - self._first_tick) / self.rate_hz)
+    def _payload(self, clock_s: float, tip: Pose) -> bytes:
+        time_ns = _BACK_NS + round(1e9 * (clock_s - self._started_s))
         if self.faulty("wrong_time"):
             time_ns -= _BACK_NS
         flange = compose(compose(BASE_SENSOR, tip), inverse(FLANGE_INDENTER))

@@ -146,14 +146,11 @@ class RosEmulator(RoutedEmulator):
         ticker = SampleTicker(self.rate_hz, self._stop)
         began_s, began_ns = time.monotonic(), time.time_ns()
         self._set_lead(began_s)
-        last_s, clock_s = began_s, 0.0
         while not self._stop.is_set():
             ticker.fast = self._drift if self.faulty("clock_drift") else 0.0
             due_s = ticker.wait()
-            clock_s += (due_s - last_s) * (1.0 + ticker.fast)
-            last_s = due_s
             if not self._gone():
-                self._step(due_s - began_s, began_ns + round(1e9 * clock_s))
+                self._step(due_s - began_s, began_ns + round(1e9 * ticker.clock_s))
 
     def _set_lead(self, began_s: float) -> None:
         """What is measured follows the host's clock."""
