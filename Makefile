@@ -57,8 +57,8 @@ test: $(VENV)/.dev  ## tests of every file, the gates of `check` among them; wha
 nightly: $(VENV)/.dev  ## all tests: each night, before a release, after a change that reaches far | 30-55 min on two cores
 	$(call run_tests,)
 
-durations: $(VENV)/.dev  ## all tests; measure anew what `quick` and `test` leave out | 30-55 min on two cores
-	@$(pytest_parallel) --record-durations
+durations: $(VENV)/.dev  ## all tests, or FILES="tests/..."; measure anew what `quick` and `test` leave out | 30-55 min on two cores
+	@$(pytest_parallel) --record-durations $(FILES)
 
 # The gates are written here and nowhere else: tests/house/test_style.py reads and runs these lines.
 check: $(VENV)/.dev  ## format, lint, types, borders, wire contract, house tests | 1-2 min

@@ -108,6 +108,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     # Reports of a parallel run arrive at the process that started the workers.
     if config.getoption("--record-durations") and not hasattr(config, "workerinput"):
+        if config.getoption("keyword") or any("::" in one for one in config.args):
+            raise pytest.UsageError("--record-durations measures whole files: name no single tests")
         config.pluginmanager.register(_Recording())
 
 
@@ -128,7 +130,10 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 class _Recording:
-    """Adds up what each test and each shared fixture takes, and writes what tiers leave out."""
+    """Adds up what each test and each shared fixture takes, and writes what tiers leave out.
+
+    What is known of files that do not run now is kept.
+    """
 
     def __init__(self) -> None:
         self._seconds: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
@@ -152,11 +157,17 @@ class _Recording:
         files = {
             file: {"seconds": round(self._files[file], 1)}
             | {name: sorted(tier.left_out(tests)) for name, tier in TIERS.items()}
-            for file, tests in sorted(self._seconds.items())
+            for file, tests in self._seconds.items()
             if self._files[file] > TIERS["quick"].file_s
         }
-        fixtures = {name: s for name, s in sorted(self._fixtures.items()) if s > shortest}
-        table = {"fixtures": fixtures, "files": files}
+        fixtures = {name: s for name, s in self._fixtures.items() if s > shortest}
+        recorded: dict[str, dict[str, Any]] = json.loads(DURATIONS.read_text(encoding="utf-8"))
+        for new, known in ((files, recorded["files"]), (fixtures, recorded["fixtures"])):
+            for name, entry in known.items():
+                file = name.partition("::")[0]
+                if file not in self._seconds and (ROOT / file).exists():
+                    new.setdefault(name, entry)
+        table = {"fixtures": dict(sorted(fixtures.items())), "files": dict(sorted(files.items()))}
         DURATIONS.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
 
 
