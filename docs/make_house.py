@@ -10,6 +10,7 @@ room only those are drawn that no longer path implies.
 from __future__ import annotations
 
 import ast
+import runpy
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
 ROOT = Path(__file__).resolve().parents[1]
 PICTURE = ROOT / "docs" / "pictures" / "house.svg"
 ROOMS = {
@@ -259,17 +261,8 @@ def crossings(graph: Graph) -> set[tuple[str, str]]:
     return {(source, target) for source, target in pairs if source != target}
 
 
-def main() -> None:
-    """Write or check the picture."""
+if __name__ == "__main__":
     modules = product_modules()
     graph = import_graph(modules)
     fresh = draw(box_graph(modules, graph), crossings(graph))
-    if sys.argv[1:] == ["--check"]:
-        if not PICTURE.exists() or PICTURE.read_text(encoding="utf-8") != fresh:
-            raise SystemExit("docs/pictures/house.svg is not what the imports say; run: make docs")
-        return
-    PICTURE.write_text(fresh, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    sys.exit(FRESH["write_or_check"]({PICTURE: fresh}))
