@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.anatomy import spatial_modes
+from palpate_fem.arrays import Floats
 from palpate_fem.electrodes.specimen import SENSING, SpecimenParameters
 
-Floats = NDArray[np.float64]
 Counts = NDArray[np.uint16]
 
 FULL_SCALE = 4095
