@@ -63,7 +63,7 @@ def import_graph(modules: Mapping[str, Path]) -> Graph:
     return graph
 
 
-def _box_of(module: str, modules: Mapping[str, Path]) -> str | None:
+def _box_of(module: str) -> str | None:
     """The box that a module is drawn in: the first part of its name below the room's package."""
     parts = module.split(".")
     if len(parts) == 1 or parts[:2] == ["palpate", "v1"]:
@@ -71,14 +71,14 @@ def _box_of(module: str, modules: Mapping[str, Path]) -> str | None:
     return ".".join(parts[:2])
 
 
-def box_graph(modules: Mapping[str, Path], graph: Graph) -> Graph:
+def box_graph(graph: Graph) -> Graph:
     """Imports between boxes, those inside a box left out."""
     boxes: Graph = defaultdict(set)
     for module, targets in graph.items():
-        source = _box_of(module, modules)
+        source = _box_of(module)
         if source is None:
             continue
-        boxes[source] |= {box for target in targets if (box := _box_of(target, modules))} - {source}
+        boxes[source] |= {box for target in targets if (box := _box_of(target))} - {source}
     return dict(sorted(boxes.items()))
 
 
@@ -264,5 +264,5 @@ def crossings(graph: Graph) -> set[tuple[str, str]]:
 if __name__ == "__main__":
     modules = product_modules()
     graph = import_graph(modules)
-    fresh = draw(box_graph(modules, graph), crossings(graph))
+    fresh = draw(box_graph(graph), crossings(graph))
     sys.exit(FRESH["write_or_check"]({PICTURE: fresh}))

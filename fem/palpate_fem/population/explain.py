@@ -176,7 +176,7 @@ class TouchExplainer:
         )
         return Explanation(expected, probability, prior.warmth + rise, error, learned)
 
-    def learn(self, touches: SensorTouches, *, rounds: int = 8) -> Explanation:
+    def learn(self, touches: SensorTouches) -> Explanation:
         """Explain touches until their prior is the one that they teach.
 
         Raises:
@@ -184,7 +184,7 @@ class TouchExplainer:
         """
         places = self._library.candidates(touches.force)
         found = self.explain(touches, TouchPrior(), places=places)
-        for _ in range(rounds):
+        for _ in range(8):
             found = self.explain(touches, found.learned, places=places)
         return found
 
