@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import logging
 import secrets
 import threading
 import time
@@ -56,8 +55,6 @@ from palpate.bus.zenoh_session import (
 from palpate.config import LinkConfig, check_name
 from palpate.errors import LinkError, PalpateError, WireError
 from palpate.process import Closing
-
-_log = logging.getLogger(__name__)
 
 _OBSERVER_WAIT_S = 1.0
 """How long a session that has joined looks for its router once more [s]."""
