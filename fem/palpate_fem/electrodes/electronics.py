@@ -184,7 +184,3 @@ def _followed(goal: Floats, ways: Floats, start: Floats) -> Floats:
         out[begin : begin + _BLOCK] = (start + np.cumsum(gain * piece, axis=0)) / grown
         start = out[min(begin + _BLOCK, len(goal)) - 1]
     return out
-
-
-PDC_PA = 36.5
-"""Pressure of one count of PDC [Pa]."""
