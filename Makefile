@@ -113,6 +113,7 @@ mutants: $(VENV)/.dev  ## plant small faults in the central modules: which do th
 	$(BIN)/python -m tests.mutation.run $(MODULES)
 	$(BIN)/python -m tests.mutation.page
 
+# docs/make_field_picture.py draws docs/pictures/field.png of the README; run it when field-twin is trained anew.
 docs: $(VENV)/.dev  ## regenerate generated pages and pictures, check all links | 20 s
 	$(BIN)/python docs/make_messages.py
 	$(BIN)/python docs/make_asyncapi.py

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import sys
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -36,6 +37,7 @@ from palpate.bus.topics import (
 from palpate.codec import ERROR, STAGE_TIMINGS, Codec
 from palpate.config import DEFAULT_ROUTER, Role
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
 FOLDER = Path(__file__).resolve().parent
 PROTOS = FOLDER.parent / "protos" / "palpate" / f"v{CONTRACT_VERSION}"
 DOCUMENT, PAGE = FOLDER / "asyncapi.json", FOLDER / "asyncapi.md"
@@ -337,25 +339,9 @@ def page() -> str:
     return "\n".join(lines)
 
 
-def main(arguments: list[str]) -> int:
-    """Write both files, or compare them."""
+if __name__ == "__main__":
     wanted = {
         DOCUMENT: json.dumps(document(), indent=1, ensure_ascii=False) + "\n",
         PAGE: page(),
     }
-    if "--check" in arguments:
-        stale = [
-            path.name
-            for path, text in wanted.items()
-            if not path.is_file() or path.read_text(encoding="utf-8") != text
-        ]
-        for name in stale:
-            sys.stderr.write(f"docs/{name} is not fresh: python docs/make_asyncapi.py\n")
-        return 1 if stale else 0
-    for path, text in wanted.items():
-        path.write_text(text, encoding="utf-8")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(FRESH["write_or_check"](wanted))

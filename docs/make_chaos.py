@@ -9,11 +9,14 @@
 from __future__ import annotations
 
 import json
+import runpy
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
+_table: Callable[[str, Iterable[Iterable[str]]], str] = FRESH["table"]
 RESULTS = Path(__file__).parent / "results"
 FILE, PAGE, PICTURE = (RESULTS / f"chaos.{kind}" for kind in ("json", "md", "png"))
 
@@ -77,12 +80,6 @@ Not corrected:
   processor: the whole stack after a kill of its unit, and the finite elements. On an idle one
   `palpate bench restart` finds 1 to 3 s ([serving](serving.md)).
 """
-
-
-def _table(columns: str, rows: Iterable[Iterable[str]]) -> str:
-    heads = [column.strip() for column in columns.split("|")]
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _yes(met: bool) -> str:
@@ -232,21 +229,8 @@ def draw(found: dict[str, Any]) -> None:
     figure.savefig(PICTURE, dpi=100)
 
 
-def main() -> int:
-    """Write or check the page; the exit code."""
-    found = json.loads(FILE.read_text(encoding="utf-8"))
-    text = page(found)
-    if sys.argv[1:] == ["--check"]:
-        if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != text:
-            sys.stderr.write(
-                f"{PAGE.name} is not what {FILE.name} says: python docs/make_chaos.py\n"
-            )
-            return 1
-        return 0
-    PAGE.write_text(text, encoding="utf-8")
-    draw(found)
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    found = json.loads(FILE.read_text(encoding="utf-8"))
+    if "--check" not in sys.argv[1:]:
+        draw(found)
+    sys.exit(FRESH["write_or_check"]({PAGE: page(found)}))

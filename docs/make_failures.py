@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ast
 import re
+import runpy
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -23,6 +24,7 @@ from palpate.errors import ErrorCode
 from palpate.messages import FaultKind, QualityFlag, SensorState, ServiceState
 from palpate_services.inference.estimates import EstimateRefusal
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "failures.md"
 ROOMS = ("protos", "gateway", "services", "fem", "training", "deploy")
@@ -453,17 +455,5 @@ def page() -> str:
     return "\n".join(lines)
 
 
-def main(arguments: list[str]) -> int:
-    """Write the page, or compare it."""
-    fresh = page()
-    if "--check" in arguments:
-        if not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != fresh:
-            sys.stderr.write("docs/failures.md is not fresh: python docs/make_failures.py\n")
-            return 1
-        return 0
-    PAGE.write_text(fresh, encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(FRESH["write_or_check"]({PAGE: page()}))

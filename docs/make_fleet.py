@@ -9,12 +9,15 @@
 from __future__ import annotations
 
 import json
+import runpy
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
+_table: Callable[[str, Iterable[Iterable[str]]], str] = FRESH["table"]
 DOCS = Path(__file__).parent
 FILE = DOCS / "results" / "fleet.json"
 RESULTS = DOCS / "results" / "fleet.md"
@@ -31,12 +34,6 @@ PHASES = {
     "electrodes": "raw frames of every station",
 }
 FAULTS = {"kill": "killed", "stop": "stopped (SIGSTOP)", "cut": "cable pulled"}
-
-
-def _table(columns: str, rows: Iterable[Iterable[str]]) -> str:
-    heads = [column.strip() for column in columns.split("|")]
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _per_station(scale: list[dict[str, Any]], phase: str, value: str) -> float:
@@ -195,26 +192,10 @@ def page_with(text: str, table: str) -> str:
     return f"{before}{BEGIN}\n\n{table}\n{END}{after}"
 
 
-def main() -> int:
-    """Write or check."""
+if __name__ == "__main__":
     values = json.loads(FILE.read_text(encoding="utf-8"))
     wanted = {
         RESULTS: results_page(values).rstrip() + "\n",
         PAGE: page_with(PAGE.read_text(encoding="utf-8"), plan_table(values)),
     }
-    if "--check" not in sys.argv:
-        for path, text in wanted.items():
-            path.write_text(text, encoding="utf-8")
-        return 0
-    stale = [
-        path.name
-        for path, text in wanted.items()
-        if not path.exists() or path.read_text(encoding="utf-8") != text
-    ]
-    if stale:
-        sys.stderr.write(f"{', '.join(stale)}: not as fleet.json says; run docs/make_fleet.py\n")
-    return 1 if stale else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(FRESH["write_or_check"](wanted))

@@ -10,6 +10,7 @@ room only those are drawn that no longer path implies.
 from __future__ import annotations
 
 import ast
+import runpy
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
 ROOT = Path(__file__).resolve().parents[1]
 PICTURE = ROOT / "docs" / "pictures" / "house.svg"
 ROOMS = {
@@ -61,7 +63,7 @@ def import_graph(modules: Mapping[str, Path]) -> Graph:
     return graph
 
 
-def _box_of(module: str, modules: Mapping[str, Path]) -> str | None:
+def _box_of(module: str) -> str | None:
     """The box that a module is drawn in: the first part of its name below the room's package."""
     parts = module.split(".")
     if len(parts) == 1 or parts[:2] == ["palpate", "v1"]:
@@ -69,14 +71,14 @@ def _box_of(module: str, modules: Mapping[str, Path]) -> str | None:
     return ".".join(parts[:2])
 
 
-def box_graph(modules: Mapping[str, Path], graph: Graph) -> Graph:
+def box_graph(graph: Graph) -> Graph:
     """Imports between boxes, those inside a box left out."""
     boxes: Graph = defaultdict(set)
     for module, targets in graph.items():
-        source = _box_of(module, modules)
+        source = _box_of(module)
         if source is None:
             continue
-        boxes[source] |= {box for target in targets if (box := _box_of(target, modules))} - {source}
+        boxes[source] |= {box for target in targets if (box := _box_of(target))} - {source}
     return dict(sorted(boxes.items()))
 
 
@@ -259,17 +261,8 @@ def crossings(graph: Graph) -> set[tuple[str, str]]:
     return {(source, target) for source, target in pairs if source != target}
 
 
-def main() -> None:
-    """Write or check the picture."""
+if __name__ == "__main__":
     modules = product_modules()
     graph = import_graph(modules)
-    fresh = draw(box_graph(modules, graph), crossings(graph))
-    if sys.argv[1:] == ["--check"]:
-        if not PICTURE.exists() or PICTURE.read_text(encoding="utf-8") != fresh:
-            raise SystemExit("docs/pictures/house.svg is not what the imports say; run: make docs")
-        return
-    PICTURE.write_text(fresh, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    fresh = draw(box_graph(graph), crossings(graph))
+    sys.exit(FRESH["write_or_check"]({PICTURE: fresh}))

@@ -9,11 +9,14 @@
 from __future__ import annotations
 
 import json
+import runpy
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
+_table: Callable[[str, Iterable[Iterable[str]]], str] = FRESH["table"]
 FILE = Path(__file__).parent / "results" / "install.json"
 PAGE = FILE.with_suffix(".md")
 
@@ -31,12 +34,6 @@ leaves. Made by `make debian`, which needs root, debootstrap and a network, and 
 `python docs/make_install.py`.
 How to install: [install.md](../install.md).
 """
-
-
-def _table(columns: str, rows: Iterable[Iterable[str]]) -> str:
-    heads = [column.strip() for column in columns.split("|")]
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _steps(values: dict[str, Any], part: str) -> str:
@@ -143,19 +140,6 @@ def page(values: dict[str, Any]) -> str:
     return f"{HEAD}\n{where}\n## How closed the units are\n\n{_scores(values)}{parts}"
 
 
-def main() -> int:
-    """Write or check the page; the exit code."""
-    text = page(json.loads(FILE.read_text(encoding="utf-8")))
-    if sys.argv[1:] == ["--check"]:
-        if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != text:
-            sys.stderr.write(
-                f"{PAGE.name} is not what {FILE.name} says: python docs/make_install.py\n"
-            )
-            return 1
-        return 0
-    PAGE.write_text(text, encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    text = page(json.loads(FILE.read_text(encoding="utf-8")))
+    sys.exit(FRESH["write_or_check"]({PAGE: text}))

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import runpy
 import subprocess
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from pathlib import Path
 
 from google.protobuf import descriptor_pb2
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "messages.md"
 HEAD = """\
@@ -129,15 +131,6 @@ def page_of(files: Iterable[descriptor_pb2.FileDescriptorProto]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    """Write the page, or compare it."""
-    page = page_of(read_contract(ROOT / "protos"))
-    if "--check" in sys.argv[1:]:
-        if not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != page:
-            raise SystemExit("docs/messages.md is not what the .proto files say -> run: make docs")
-        return
-    PAGE.write_text(page, encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    page = page_of(read_contract(ROOT / "protos"))
+    sys.exit(FRESH["write_or_check"]({PAGE: page}))

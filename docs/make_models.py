@@ -6,12 +6,14 @@
 
 from __future__ import annotations
 
+import runpy
 import sys
 from pathlib import Path
 
 from palpate.files.bundle import read_bundle
 from palpate.files.card import model_card
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "models.md"
 MODELS = ROOT / "services" / "palpate_services" / "models"
@@ -37,15 +39,5 @@ def page() -> str:
     return "\n".join(parts)
 
 
-def main() -> None:
-    """Write or check."""
-    fresh = page()
-    if "--check" in sys.argv:
-        if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != fresh:
-            raise SystemExit(f"{PAGE} is not what {sys.argv[0]} would write: run make docs")
-        return
-    PAGE.write_text(fresh, encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    sys.exit(FRESH["write_or_check"]({PAGE: page()}))

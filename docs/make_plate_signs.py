@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from palpate.rigid import rotation_matrices
 from palpate_deploy.experiment import parameters_of
-from palpate_fem.electrodes.electronics import PDC_PA
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.mechanics.load_stepping import SolverSettings
 from palpate_fem.mechanics.solver import Fingertip
@@ -39,6 +38,8 @@ OUT = Path(__file__).parent / "results" / "twin" / "plate.md"
 PLATE = make_indenter("plate")
 STEP_M = 1e-4
 STEPS = 34
+PDC_PA = 36.5
+"""Pressure of one count of PDC [Pa]."""
 WORDS = {1: "rises", -1: "falls", 0: "-"}
 
 HEAD = """# Under a plate: the twin beside the real sensor

@@ -9,11 +9,13 @@
 from __future__ import annotations
 
 import json
+import runpy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
 FILE = Path(__file__).parent / "results" / "readers.json"
 PAGE = FILE.with_suffix(".md")
 
@@ -70,17 +72,6 @@ def page(values: dict[str, Any]) -> str:
     return f"{HEAD}\n{''.join(_summary(readers))}\n{where}{parts}"
 
 
-def main() -> int:
-    """Write or check the page; the exit code."""
-    text = page(json.loads(FILE.read_text(encoding="utf-8")))
-    if sys.argv[1:] == ["--check"]:
-        if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != text:
-            sys.stderr.write(f"{PAGE.name} is not what {FILE.name} says: {__doc__}\n")
-            return 1
-        return 0
-    PAGE.write_text(text, encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    text = page(json.loads(FILE.read_text(encoding="utf-8")))
+    sys.exit(FRESH["write_or_check"]({PAGE: text}))

@@ -9,14 +9,17 @@
 from __future__ import annotations
 
 import json
+import runpy
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from palpate_deploy.bench.growth import LIMIT_MB_PER_H
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
+_table: Callable[[str, Iterable[Iterable[str]]], str] = FRESH["table"]
 FOLDER = Path(__file__).parent / "results" / "serving"
 PAGE = FOLDER.with_suffix(".md")
 
@@ -31,12 +34,6 @@ devices](faults.md).
 
 def _read(name: str) -> Any:
     return json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
-
-
-def _table(columns: str, rows: Iterable[Iterable[str]]) -> str:
-    heads = [column.strip() for column in columns.split("|")]
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _section(title: str, command: str, values: Any, text: str) -> str:
@@ -300,14 +297,5 @@ def page() -> str:
     return HEAD + "".join(make() for make in there)
 
 
-def main() -> None:
-    """Write the page, or check it."""
-    if "--check" in sys.argv[1:]:
-        if PAGE.read_text(encoding="utf-8") != page():
-            raise SystemExit(f"{PAGE} is out of date: python docs/make_serving.py")
-        return
-    PAGE.write_text(page(), encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    sys.exit(FRESH["write_or_check"]({PAGE: page()}))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import runpy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 
 from palpate_training.figures.style import markdown_table
 
+FRESH = runpy.run_path(str(Path(__file__).with_name("fresh.py")))
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results" / "study.md"
 STUDIES = ROOT / "docs" / "results" / "study"
@@ -382,15 +384,5 @@ def page() -> str:
     return head + table + with_more_presses() + TAIL.format(hard=hard, curve=curve(), **figures)
 
 
-def main() -> None:
-    """Write or check."""
-    fresh = page()
-    if "--check" in sys.argv:
-        if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != fresh:
-            raise SystemExit(f"{PAGE} is not what {sys.argv[0]} would write: run make docs")
-        return
-    PAGE.write_text(fresh, encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    sys.exit(FRESH["write_or_check"]({PAGE: page()}))

@@ -253,8 +253,9 @@ def _watch(tip: Fingertip) -> dict[str, float]:
     return spent
 
 
-def _peak_gflops(kind: type[np.floating[Any]], size: int = 2000) -> float:
+def _peak_gflops(kind: type[np.floating[Any]]) -> float:
     """Best rate of a dense product on all cores [GFlop/s]."""
+    size = 2000
     a = np.random.default_rng(0).normal(size=(size, size)).astype(kind)
     best = np.inf
     for _ in range(5):

@@ -35,11 +35,32 @@ LINE_EVERY_S = 30.0
 """Least time between two lines on progress in a log [s]."""
 
 
+def cpu_time_s(pid: int) -> float:
+    """Processor time of all threads of a process since its start [s].
+
+    Raises:
+        OSError: It has ended, or this is not Linux.
+    """
+    text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    words = text.rpartition(")")[2].split()  # the program's name, in brackets, may hold anything
+    return (int(words[11]) + int(words[12])) / _TICKS_HZ
+
+
+def resident_bytes(pid: int) -> int:
+    """Resident memory of a process [bytes].
+
+    Raises:
+        OSError: It has ended, or this is not Linux.
+    """
+    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
+    return pages * _PAGE_BYTES
+
+
 class ProcessUsage:
     """Measures one process of this host, by default this one. Safe to use from several threads."""
 
     def __init__(self, pid: int | None = None) -> None:
-        self._folder = Path("/proc") / ("self" if pid is None else str(pid))
+        self._pid = os.getpid() if pid is None else pid
         self._lock = threading.Lock()
         self._gauges: dict[str, float] = {}
         self._looked_s = time.monotonic()
@@ -60,9 +81,9 @@ class ProcessUsage:
             cpu_s = self._cpu_time_s()
             try:
                 gauges = {
-                    "process_rss_bytes": float(self._statm()[1] * _PAGE_BYTES),
-                    "process_threads": float(len(os.listdir(self._folder / "task"))),
-                    "process_open_files": float(len(os.listdir(self._folder / "fd"))),
+                    "process_rss_bytes": float(resident_bytes(self._pid)),
+                    "process_threads": float(len(os.listdir(f"/proc/{self._pid}/task"))),
+                    "process_open_files": float(len(os.listdir(f"/proc/{self._pid}/fd"))),
                 }
             except (OSError, ValueError, IndexError):  # not Linux, not allowed, or it has ended
                 gauges = {}
@@ -73,15 +94,9 @@ class ProcessUsage:
             self._gauges = gauges
             return gauges
 
-    def _statm(self) -> list[int]:
-        return [int(word) for word in (self._folder / "statm").read_text().split()]
-
     def _cpu_time_s(self) -> float | None:
-        """Processor time of all its threads since its start [s]."""
         try:
-            # The name of the program, in brackets, may hold anything.
-            words = (self._folder / "stat").read_text().rpartition(")")[2].split()
-            return (int(words[11]) + int(words[12])) / _TICKS_HZ
+            return cpu_time_s(self._pid)
         except (OSError, ValueError, IndexError):
             return None
 

@@ -20,7 +20,7 @@ Times = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class SampleTimes:
-    """Instants of one frame's channels [ns], by the monotonic or wall clock, or since its stamp.
+    """Instants of one frame's channels since its stamp [ns].
 
     Attributes:
         electrodes: Of E1, E2, ... [ns], int64, shape ``(E,)``.
@@ -37,16 +37,6 @@ class SampleTimes:
     def middle_ns(self) -> int:
         """Mean instant of the electrodes [ns]: where one wrench for all of them belongs."""
         return round(float(np.mean(self.electrodes - self.electrodes[0]))) + int(self.electrodes[0])
-
-    def shifted(self, by_ns: int) -> SampleTimes:
-        """The same on a clock that is ahead [ns]."""
-        return SampleTimes(
-            self.electrodes + by_ns,
-            self.pdc + by_ns,
-            self.tac + by_ns,
-            self.tdc + by_ns,
-            self.pac + by_ns,
-        )
 
 
 def slots_of(layout: FrameLayout, *, pac_first: bool = False) -> Times:
@@ -84,8 +74,3 @@ def sample_offsets(frame: ElectrodeFrame, *, pac_first: bool = False) -> SampleT
         int(offsets[layout.tdc_bit]),
         offsets[layout.first_pac_bit :],
     )
-
-
-def sample_times(frame: ElectrodeFrame, *, pac_first: bool = False) -> SampleTimes:
-    """When each channel was sampled by the monotonic clock of the frame's stamp [ns]."""
-    return sample_offsets(frame, pac_first=pac_first).shifted(frame.stamp.monotonic_ns)

@@ -10,10 +10,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.result import Convergence, IndentationOutcome, IndentationResult, IndentationStep
-from palpate_fem.store.content import Floats, Ints, Outline, StoredFingertip
+from palpate_fem.store.content import Outline, StoredFingertip
 
 INNER_M = 5.5e-3
 OUTER_M = 7.0e-3

@@ -13,7 +13,7 @@ import pytest
 
 from palpate.errors import ConfigError, DatasetError, SimulationError
 from palpate.rigid import path_lengths
-from palpate_fem.calibration.alignment import Floats
+from palpate_fem.arrays import Floats
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import MeasuredIndentation
 from palpate_fem.calibration.recover import recover

@@ -11,7 +11,7 @@ import pytest
 
 from palpate.errors import ConfigError, SimulationError
 from palpate.rigid import path_lengths
-from palpate_fem.calibration.alignment import Floats
+from palpate_fem.arrays import Floats
 from palpate_fem.calibration.measured import MeasuredIndentation
 from palpate_fem.calibration.runs import FingertipSimulator, SimulatedRun, SimulationRuns
 from palpate_fem.calibration.settings import FRICTION, PAPER_BOUNDS, THICKNESS, CalibrationSettings

@@ -15,7 +15,7 @@ import pytest
 
 from palpate.errors import DatasetError
 from palpate.rigid import path_lengths
-from palpate_fem.calibration.alignment import Floats
+from palpate_fem.arrays import Floats
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation, write_indentations
 from palpate_fem.calibration.runs import SimulatedRun, simulate_all
 from palpate_fem.config import FingertipParameters

@@ -142,6 +142,7 @@ def test_palpate_commands_exist(
     [
         "make_messages.py",
         "make_asyncapi.py",
+        "make_chaos.py",
         "make_failures.py",
         "make_fleet.py",
         "make_house.py",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.messages import ElectrodeFrame, Origin, SensorType, Stamp
-from palpate.sampling import is_polled, sample_offsets, sample_times, slots_of
+from palpate.sampling import is_polled, sample_offsets, slots_of
 
 SLOT_NS = 227_273
 START_NS = 5_000_000_000
@@ -59,13 +59,6 @@ def test_a_biotac_sp_has_54_slots() -> None:
     assert len(offsets.electrodes) == 24
     assert offsets.pac[-1] == 53 * SLOT_NS
     assert offsets.pdc == 48 * SLOT_NS
-
-
-def test_times_are_those_of_the_stamps_clock() -> None:
-    times = sample_times(frame())
-    assert times.electrodes[0] == START_NS
-    assert times.pac[3] == START_NS + 7 * SLOT_NS
-    assert times.middle_ns == START_NS + 18 * SLOT_NS
 
 
 def test_of_a_polled_frame_and_of_a_simulated_one_nothing_is_pretended() -> None:

@@ -282,12 +282,6 @@ class FaultStation:
         self._run.stop()
 
 
-def resident_bytes(pid: int) -> int:
-    """Resident memory of a process [bytes]."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
-
-
 def seconds_until(true: Callable[[], bool]) -> float:
     """Time until something holds [s]; infinity if it does not within ``RECOVERY_S``."""
     began_s = time.monotonic()

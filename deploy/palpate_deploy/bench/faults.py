@@ -27,12 +27,12 @@ from palpate.bus import Delivery
 from palpate.bus.topics import ELECTRODES, FEATURES, STATUS
 from palpate.errors import ConfigError, PalpateError, StaleError, StreamTimeout
 from palpate.messages import SensorState, ServiceState
+from palpate.process import resident_bytes
 from palpate_deploy.bench.fault_station import (
     RECOVERY_S,
     SENSOR,
     FaultStation,
     Figures,
-    resident_bytes,
     seconds_until,
 )
 from palpate_deploy.bench.results import finish, progress_bar

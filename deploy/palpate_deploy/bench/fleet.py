@@ -29,6 +29,7 @@ from rich.console import Console
 
 from palpate.config import Role
 from palpate.errors import LinkError
+from palpate.process import cpu_time_s, resident_bytes
 from palpate_deploy.bench.harness import read_rows
 from palpate_deploy.bench.hosts import HostLab, LabHost
 from palpate_deploy.bench.results import finish, machine, write_result
@@ -42,7 +43,6 @@ _STOP_S = 20.0
 _HOSTS_MOST = 24
 _LOCAL = f"tls/127.0.0.1:{PORT}"
 _TICKS_HZ = os.sysconf("SC_CLK_TCK")
-_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 FAULTS = ("kill", "stop", "cut")
 
 
@@ -125,13 +125,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         os.killpg(process.pid, signal.SIGKILL)
 
 
-def _usage(pid: int) -> tuple[float, int]:
-    """Processor time [s] and resident memory [bytes] of a process."""
-    words = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1])
-    return (int(words[11]) + int(words[12])) / _TICKS_HZ, pages * _PAGE_BYTES
-
-
 def _until(true: Callable[[], Any], what: str, seconds: float = _START_S) -> None:
     end_s = time.monotonic() + seconds
     while not true():
@@ -174,15 +167,15 @@ def measure_scale(stations: int, seconds: float) -> dict[str, Any]:
                 time.sleep(_SETTLE_S)
             before, cpu_s, began_s = (
                 [sum(fleet.lab.crossed_bytes(host)) for host in hosts],
-                _usage(site.pid)[0],
+                cpu_time_s(site.pid),
                 time.monotonic(),
             )
-            station_s = [_usage(one.pid)[0] for one in routers]
+            station_s = [cpu_time_s(one.pid) for one in routers]
             time.sleep(seconds)
             took_s = time.monotonic() - began_s
             after = [sum(fleet.lab.crossed_bytes(host)) for host in hosts]
-            used_s, rss = _usage(site.pid)
-            spent = [_usage(one.pid)[0] - was for one, was in zip(routers, station_s, strict=True)]
+            used_s, rss = cpu_time_s(site.pid), resident_bytes(site.pid)
+            spent = [cpu_time_s(one.pid) - was for one, was in zip(routers, station_s, strict=True)]
             phases[topic] = {
                 "bytes_hz_each": round(
                     float(np.mean([b - a for a, b in zip(before, after, strict=True)])) / took_s
@@ -190,7 +183,9 @@ def measure_scale(stations: int, seconds: float) -> dict[str, Any]:
                 "site_cpu_ratio": (used_s - cpu_s) / took_s,
                 "site_rss_bytes": rss,
                 "station_router_cpu_ratio": float(np.mean(spent)) / took_s,
-                "station_router_rss_bytes": float(np.mean([_usage(r.pid)[1] for r in routers])),
+                "station_router_rss_bytes": float(
+                    np.mean([resident_bytes(r.pid) for r in routers])
+                ),
             }
             if watching is not None:
                 stop_child(watching, _STOP_S)
@@ -456,14 +451,14 @@ def measure_whole_station(seconds: float) -> dict[str, Any]:
             text = _profile("arm1", [service], certs, connect=_LOCAL, more=more)
             processes[service] = fleet.run(host.inside, service, text)
         time.sleep(20.0)
-        before = {service: _usage(one.pid)[0] for service, one in processes.items()}
+        before = {service: cpu_time_s(one.pid) for service, one in processes.items()}
         began_s = time.monotonic()
         time.sleep(seconds)
         took_s = time.monotonic() - began_s
         return {
             service: {
-                "cpu_ratio": (_usage(one.pid)[0] - before[service]) / took_s,
-                "rss_bytes": _usage(one.pid)[1],
+                "cpu_ratio": (cpu_time_s(one.pid) - before[service]) / took_s,
+                "rss_bytes": resident_bytes(one.pid),
             }
             for service, one in processes.items()
         }

@@ -26,6 +26,7 @@ from rich.table import Table
 
 from palpate.errors import LinkError
 from palpate.messages import Status
+from palpate.process import cpu_time_s
 from palpate_deploy.bench.harness import read_rows
 from palpate_deploy.bench.results import finish, progress_bar
 from palpate_deploy.bench.station import free_port, gateway_station, wait_ready
@@ -225,18 +226,18 @@ def measure_hand(seconds: float, floor_seconds: float, bar: Progress) -> HandRes
         time.sleep(_SETTLE_S)
         pid = children.pid("gateway")
         before = _status(profile).counters
-        begin_ns, used_s, shares = time.monotonic_ns(), _cpu_s(pid), []
+        begin_ns, used_s, shares = time.monotonic_ns(), cpu_time_s(pid), []
         looks: list[Status] = []
         host = _host_ticks()
         for _ in range(10):
-            part_s, part_used_s = time.monotonic(), _cpu_s(pid)
+            part_s, part_used_s = time.monotonic(), cpu_time_s(pid)
             time.sleep(seconds / 10)
-            shares.append((_cpu_s(pid) - part_used_s) / (time.monotonic() - part_s))
+            shares.append((cpu_time_s(pid) - part_used_s) / (time.monotonic() - part_s))
             children.check(["gateway", "client", *(f"emulator-{n}" for n in range(4))])
             looks.append(_status(profile))
             bar.advance(task)
         end_ns = time.monotonic_ns()
-        core = (_cpu_s(pid) - used_s) / ((end_ns - begin_ns) * 1e-9)
+        core = (cpu_time_s(pid) - used_s) / ((end_ns - begin_ns) * 1e-9)
         total, stolen = (now - then for now, then in zip(_host_ticks(), host, strict=True))
         drops = _kernel_drops(pid)
         children.stop_one("client")
@@ -324,12 +325,6 @@ def _start_gateway(
     children.start("gateway", command_line("gateway", write_profile(profile, children.folder)))
     wait_ready(profile, {"gateway"})
     return profile
-
-
-def _cpu_s(pid: int) -> float:
-    """User and system time of a process so far [s]."""
-    fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _host_ticks() -> tuple[int, int]:

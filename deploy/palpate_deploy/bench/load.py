@@ -6,7 +6,7 @@ the stages of an estimate as its service notes them.
 
 from __future__ import annotations
 
-import os
+import contextlib
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass, field
@@ -17,6 +17,7 @@ import numpy as np
 from rich.progress import Progress
 
 from palpate.messages import ServiceState
+from palpate.process import cpu_time_s
 from palpate_deploy.bench.harness import read_rows
 from palpate_deploy.bench.results import stage_medians
 from palpate_deploy.bench.station import wait_ready
@@ -36,7 +37,6 @@ _UNKNOWN_S = 1.0
 """So long frames are sent before it is known, at most [s]."""
 
 _PROCESSES = ("gateway", "service", "client", "router")
-_TICKS_HZ = os.sysconf("SC_CLK_TCK")
 
 _FIELD_QUEUE = {"rate_hz": 1000.0, "keep_newest": 10, "max_age_s": 0.5}
 """A field of every frame, as features by default, and patience for a host that is busy."""
@@ -167,12 +167,8 @@ def _cpu_s(pids: dict[str, int]) -> dict[str, float]:
     """Processor time that processes have taken so far [s]; those of Linux."""
     taken: dict[str, float] = {}
     for name, pid in pids.items():
-        try:
-            after_name = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2]
-        except OSError:  # not Linux, or it has ended
-            continue
-        user, system = after_name.split()[11:13]
-        taken[name] = (int(user) + int(system)) / _TICKS_HZ
+        with contextlib.suppress(OSError):  # not Linux, or it has ended
+            taken[name] = cpu_time_s(pid)
     return taken
 
 

@@ -45,9 +45,9 @@ def latency(rows: npt.NDArray[np.int64], *, warm_up: int, lost: int) -> Latency:
     return Latency(float(p50), float(p99), float(ages_s.max()), len(ages_s), lost)
 
 
-def rounds(rows: npt.NDArray[np.int64], *, pause_s: float = 0.3) -> list[npt.NDArray[np.int64]]:
-    """Rows cut where the source paused."""
-    gaps = np.flatnonzero(np.diff(rows[:, 1]) > pause_s * 1e9) + 1
+def rounds(rows: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
+    """Rows cut where the source paused for more than 0.3 s."""
+    gaps = np.flatnonzero(np.diff(rows[:, 1]) > 0.3e9) + 1
     return [part for part in np.split(rows, gaps) if len(part)]
 
 

@@ -22,12 +22,12 @@ from palpate.codec import ELECTRODE_FRAME, ERROR, TARE_REQUEST
 from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, PalpateError, StreamTimeout
 from palpate.messages import TareRequest
+from palpate.process import resident_bytes
 from palpate_deploy.bench.fault_station import (
     FORGED_TICK,
     SENSOR,
     FaultStation,
     Figures,
-    resident_bytes,
     seconds_until,
 )
 

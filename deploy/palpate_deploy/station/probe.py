@@ -15,7 +15,7 @@ from palpate_deploy.station.profile import Profile
 _WAIT_S = 3.0
 
 
-def why_not_live(now_ns: int | None = None) -> str:
+def why_not_live() -> str:
     """Why the process whose heartbeat is in ``$_PALPATE_HEARTBEAT`` does not live; empty = it does.
 
     Raises:
@@ -31,7 +31,7 @@ def why_not_live(now_ns: int | None = None) -> str:
     pulse = read_pulse(Path(name))
     if pulse is None:
         return "it has not beaten yet"
-    silent_s = ((time.monotonic_ns() if now_ns is None else now_ns) - pulse.beaten_ns) * 1e-9
+    silent_s = (time.monotonic_ns() - pulse.beaten_ns) * 1e-9
     allowed_s = pulse.allowed_ns * 1e-9
     if silent_s > allowed_s:
         return f"it has not beaten for {silent_s:.1f} s, and had {allowed_s:.1f} s"

@@ -189,13 +189,13 @@ class Supervisor:
             if pulse is not None and str(self.folder) in _command_of(pulse.pid):
                 yield pulse.pid
 
-    def log_tail(self, service: str, lines: int = 5) -> str:
-        """The last lines of a process's log."""
+    def log_tail(self, service: str) -> str:
+        """The last five lines of a process's log."""
         try:
             text = (self.logs / f"{service}.log").read_text(encoding="utf-8", errors="replace")
         except OSError:
             return ""
-        return "\n".join(text.splitlines()[-lines:])
+        return "\n".join(text.splitlines()[-5:])
 
     def __enter__(self) -> Self:
         return self

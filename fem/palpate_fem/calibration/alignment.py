@@ -20,12 +20,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
 from palpate.rigid import path_lengths
-
-Floats = NDArray[np.float64]
+from palpate_fem.arrays import Floats
 
 THRESHOLD_N = 0.5
 """Force at which curves begin [N] (paper, "Experimental data processing", step 3)."""

@@ -21,7 +21,8 @@ from dataclasses import replace
 import numpy as np
 
 from palpate.errors import DatasetError, SimulationError
-from palpate_fem.calibration.alignment import AlignmentError, Floats, rms_n
+from palpate_fem.arrays import Floats
+from palpate_fem.calibration.alignment import AlignmentError, rms_n
 from palpate_fem.calibration.local import LocalModel, estimates, minimise
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.point import (

@@ -20,7 +20,8 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.optimize import minimize
 
-from palpate_fem.calibration.alignment import AlignmentError, Floats, ForceCurve
+from palpate_fem.arrays import Floats
+from palpate_fem.calibration.alignment import AlignmentError, ForceCurve
 from palpate_fem.calibration.point import (
     CalibrationCase,
     SimulatedPoint,

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.hdf5 import (
@@ -33,8 +32,7 @@ from palpate.files.hdf5 import (
     text,
 )
 from palpate.files.simulation_store import check_id
-
-Floats = NDArray[np.float64]
+from palpate_fem.arrays import Floats
 
 INDENTATIONS = Hdf5Schema(
     "palpate.indentations",

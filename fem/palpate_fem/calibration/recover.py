@@ -204,7 +204,7 @@ CLEARANCE_M = 1e-3
 """Distance of the first pose from the skin [m]; the calibration tries thicker skins, too."""
 
 
-def plan_recovery(tip: Fingertip, *, steps: int = 20) -> list[PlannedPath]:
+def plan_recovery(tip: Fingertip) -> list[PlannedPath]:
     """Paths of the indentations, from first contact with this finger's pad on."""
     surface = OuterSurface(tip.nodes, tip.geometry.mesh.outer_faces)
     planned = []
@@ -220,7 +220,7 @@ def plan_recovery(tip: Fingertip, *, steps: int = 20) -> list[PlannedPath]:
             direction,
             surface,
             depth_m=press.depth_m,
-            steps=steps,
+            steps=20,
             clearance_m=CLEARANCE_M,
         )
         planned.append(PlannedPath(name, press.indenter, path))

@@ -14,7 +14,8 @@ import numpy as np
 
 from palpate.errors import ConfigError, SimulationError
 from palpate.rigid import path_lengths
-from palpate_fem.calibration.alignment import Floats, ForceCurve, along
+from palpate_fem.arrays import Floats
+from palpate_fem.calibration.alignment import ForceCurve, along
 from palpate_fem.calibration.measured import MeasuredIndentation
 from palpate_fem.config import EDGE_M, FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter

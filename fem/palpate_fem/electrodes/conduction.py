@@ -38,11 +38,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from palpate.errors import SimulationError
+from palpate_fem.arrays import Floats
 from palpate_fem.device import indices, launch, scalars
 from palpate_fem.electrodes.film import FilmMesh
 from palpate_fem.electrodes.specimen import DISC_DIAMETER_M, TERMINALS
-
-Floats = NDArray[np.float64]
 
 EDGE = (2 * np.log(2) / np.pi) ** 2
 """zeta / h of a film that is thin against its disc."""

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.anatomy import spatial_modes
+from palpate_fem.arrays import Floats
 from palpate_fem.electrodes.specimen import SENSING, SpecimenParameters
 
-Floats = NDArray[np.float64]
 Counts = NDArray[np.uint16]
 
 FULL_SCALE = 4095
@@ -184,7 +184,3 @@ def _followed(goal: Floats, ways: Floats, start: Floats) -> Floats:
         out[begin : begin + _BLOCK] = (start + np.cumsum(gain * piece, axis=0)) / grown
         start = out[min(begin + _BLOCK, len(goal)) - 1]
     return out
-
-
-PDC_PA = 36.5
-"""Pressure of one count of PDC [Pa]."""

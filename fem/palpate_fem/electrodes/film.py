@@ -10,12 +10,10 @@ from scipy.spatial import Delaunay, cKDTree
 
 from palpate.anatomy import ELECTRODE_POSITIONS, EXCITATION_POSITIONS
 from palpate.errors import ConfigError
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.electrodes.specimen import DISC_DIAMETER_M, DISC_TERMINAL
 from palpate_fem.mesh.core import RigidCore
 from palpate_fem.mesh.surface import face_vectors, open_edges
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 EDGE_M = 0.55e-3
 """Edge of the triangles between the discs [m]; gives 3,000 nodes on the BioTac."""

@@ -6,16 +6,14 @@ from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats
 from palpate_fem.electrodes.conduction import FilmConduction, FilmSolution
 from palpate_fem.electrodes.electronics import counts_slope, ideal_counts
 from palpate_fem.electrodes.film import EDGE_M, film_mesh
 from palpate_fem.electrodes.gap import Gap, GapFinder, gap_adjustment, thickness
 from palpate_fem.electrodes.specimen import SpecimenParameters
 from palpate_fem.mesh.solid import FingertipGeometry
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,11 @@ product of that gradient with a closed derivative of the thickness.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats
 from palpate_fem.electrodes.electronics import counts_slope
 from palpate_fem.electrodes.gap import gap_profiles, thickness
 from palpate_fem.electrodes.model import ElectrodeModel, ElectrodeResponse
-
-Floats = NDArray[np.float64]
 
 AXES = ("core_x_m", "core_y_m", "core_z_m")
 """Components of `SpecimenParameters.core_offset_m`."""

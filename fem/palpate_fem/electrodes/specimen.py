@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
 
@@ -27,8 +26,6 @@ about it."""
 DISC_TERMINAL = np.array([*range(1, TERMINALS), 0, 0, 0, 0], np.int32)
 """Terminal of each of the 23 discs: E1..E19, then X1..X4; shape (23,)."""
 
-
-Floats = NDArray[np.float64]
 
 # The range that the model is made for. A value outside is most likely in the wrong unit.
 LIMITS = {

@@ -90,14 +90,14 @@ def cast(field: Field, start: Floats, direction: Floats, *, reach: float) -> Flo
     return np.asarray(start + way[:, None] * direction)
 
 
-def nearest(field: Field, points: Floats, *, steps: int = 15) -> Floats:
+def nearest(field: Field, points: Floats) -> Floats:
     """Nearest points of the surface to points not far from it, shape (N, 3).
 
     Alternates Newton steps onto the surface with the tangential part of the vector to the point; it
     comes to rest where that vector is normal to the surface.
     """
     foot = project(field, points, steps=3)
-    for _ in range(steps):
+    for _ in range(15):
         _, gradient = field(foot)
         normal = gradient / np.linalg.norm(gradient, axis=1)[:, None]
         back = points - foot

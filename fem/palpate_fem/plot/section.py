@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from palpate_fem.arrays import Floats
+
 Ints = NDArray[Any]
 
 # A wedge as three tetrahedra, a hexahedron as two wedges; node order of `SolidMesh`.

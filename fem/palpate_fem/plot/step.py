@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import ConfigError
 from palpate.process import require
 from palpate.rigid import rotation_matrices
+from palpate_fem.arrays import Floats
 from palpate_fem.plot.section import cut_sides, cut_solid, cut_surface, outline
 from palpate_fem.plot.style import (
     CORE,
@@ -28,7 +28,6 @@ from palpate_fem.plot.trajectories import draw_force, travel_mm
 from palpate_fem.result import IndentationResult, IndentationStep
 from palpate_fem.store.content import Outline, StoredFingertip
 
-Floats = NDArray[np.float64]
 Quantity = Literal["displacement", "von_mises"]
 
 _MARGIN_M = 2.5e-3

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
 from palpate.rigid import path_lengths
+from palpate_fem.arrays import Floats
 from palpate_fem.plot.style import (
     AXES,
     AXIS_COLOURS,
@@ -25,8 +25,6 @@ from palpate_fem.plot.style import (
 )
 from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.store.content import TrajectorySummary
-
-Floats = NDArray[np.float64]
 
 
 def travel_m(path: Floats, pose: Floats) -> Floats:

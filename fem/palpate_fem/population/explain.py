@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
+from palpate_fem.arrays import Floats
 from palpate_fem.electrodes.model import ElectrodeModel
 from palpate_fem.electrodes.sensitivity import counts_by_log_sigma
 from palpate_fem.electrodes.specimen import SENSING
 from palpate_fem.population.press_library import Candidates, PressLibrary
 from palpate_fem.population.touches import SensorTouches
-
-Floats = NDArray[np.float64]
 
 WARMTH_SD = 0.2
 """Of ln of the conductivity between rest and a touch: in three minutes the idle sensor of the force
@@ -177,7 +176,7 @@ class TouchExplainer:
         )
         return Explanation(expected, probability, prior.warmth + rise, error, learned)
 
-    def learn(self, touches: SensorTouches, *, rounds: int = 8) -> Explanation:
+    def learn(self, touches: SensorTouches) -> Explanation:
         """Explain touches until their prior is the one that they teach.
 
         Raises:
@@ -185,7 +184,7 @@ class TouchExplainer:
         """
         places = self._library.candidates(touches.force)
         found = self.explain(touches, TouchPrior(), places=places)
-        for _ in range(rounds):
+        for _ in range(8):
             found = self.explain(touches, found.learned, places=places)
         return found
 

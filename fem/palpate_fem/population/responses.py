@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import DatasetError
+from palpate_fem.arrays import Floats
 from palpate_fem.electrodes.gap import Gap
 from palpate_fem.electrodes.model import ElectrodeModel
 from palpate_fem.electrodes.specimen import SpecimenParameters
@@ -22,9 +23,6 @@ from palpate_fem.mesh.parametric import biotac
 from palpate_fem.mesh.solid import FingertipGeometry
 from palpate_fem.result import IndentationResult, IndentationStep
 from palpate_fem.store.content import StoredFingertip
-
-Floats = NDArray[np.float64]
-
 
 _NAME = re.compile(r"biotac-(?P<thickness>[0-9.]+)mm-(?P<edge>[0-9.]+)mm-(?P<layers>\d+)")
 

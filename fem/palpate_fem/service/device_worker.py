@@ -229,7 +229,7 @@ class DeviceWorker:
         now_s = time.monotonic()
         if now_s - self._beaten_s > _BEAT_S:
             self._beaten_s = now_s
-            self._outbox.put(Swept(at_work))
+            self._outbox.put(Swept())
 
     def _give(self, number: int, result: IndentationResult) -> None:
         """Report a result, when the other end has taken those before; not its fault if it waits."""

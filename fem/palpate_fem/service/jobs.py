@@ -68,9 +68,7 @@ class JobWaiting:
 
 @dataclass(frozen=True, slots=True)
 class Pressurising:
-    """The fluid is being filled in; ``fraction`` of it is there."""
-
-    fraction: float
+    """The fluid is being filled in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,9 +193,7 @@ class ResultTaken:
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """From the process of a device: it is alive; so many trajectories are at work."""
-
-    at_work: int
+    """From the process of a device: it is alive."""
 
 
 @dataclass(frozen=True, slots=True)

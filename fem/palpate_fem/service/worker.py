@@ -84,7 +84,7 @@ class Worker:
         def on_fraction(fraction: float) -> None:
             if should_stop() is not None:
                 raise _Stopped
-            self._tell(fraction)
+            self._tell()
 
         try:
             tip = tips.get(job.parameters, on_fraction)
@@ -109,11 +109,11 @@ class Worker:
             self._cancelled.clear()  # also of what came too late for an earlier job
         return JobEnded(done.outcome, done.reason, done.travel_m, done.seconds)
 
-    def _tell(self, fraction: float) -> None:
-        """Report how much of the fluid is filled in."""
+    def _tell(self) -> None:
+        """Report that the fluid is being filled in."""
         if time.monotonic() - self._reported > _REPORT_EVERY_S:
             self._reported = time.monotonic()
-            self._report(Pressurising(fraction))
+            self._report(Pressurising())
 
     def _report(self, event: JobEvent) -> None:
         try:

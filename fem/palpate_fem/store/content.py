@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_fem.arrays import Floats, Ints
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.solid import SolidMesh
 from palpate_fem.result import IndentationOutcome
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 Setting = bool | int | float | str
 
 Outline = tuple[NDArray[np.floating[Any]], Ints]

@@ -10,7 +10,7 @@ import numpy as np
 from palpate.errors import DatasetError
 from palpate.files.simulation_store import SIMULATIONS
 from palpate.rigid import path_lengths
-from palpate_fem.calibration.alignment import Floats
+from palpate_fem.arrays import Floats
 from palpate_fem.calibration.measured import (
     MEASURED,
     SIMULATED,

@@ -138,10 +138,8 @@ class FifoQueue(Generic[T]):
 DeliveryQueue = NewestQueue[T] | FifoQueue[T]
 
 
-def queue_for(
-    delivery: Delivery, capacity: int, counters: Counter[str], *, depth: int = 1
-) -> DeliveryQueue[T]:
-    """The queue for a kind of delivery; ``depth`` is for ``NEWEST``."""
+def queue_for(delivery: Delivery, capacity: int, counters: Counter[str]) -> DeliveryQueue[T]:
+    """The queue for a kind of delivery; with ``NEWEST`` one item of a key waits."""
     if delivery is Delivery.NEWEST:
-        return NewestQueue(counters, depth)
+        return NewestQueue(counters, depth=1)
     return FifoQueue(counters, capacity, sender_waits=delivery is Delivery.EVERY)

@@ -33,13 +33,17 @@ class ForeignSample(NamedTuple):
     received_monotonic_ns: int
 
 
+_WAITING_MOST = 4096
+"""Samples that may wait."""
+
+
 class ForeignSubscriber(Closing):
     """Samples of a key expression, first in, first out. Made by ``Session.foreign_subscriber``."""
 
-    def __init__(self, session: zenoh.Session, key: str, *, capacity: int) -> None:
+    def __init__(self, session: zenoh.Session, key: str) -> None:
         self._counters: Counter[str] = Counter()
         self._waiting: FifoQueue[ForeignSample] = FifoQueue(
-            self._counters, capacity, sender_waits=False
+            self._counters, _WAITING_MOST, sender_waits=False
         )
         in_order = zenoh.handlers.Callback(self._on_sample, indirect=False)
         self._subscriber = session.declare_subscriber(key, in_order)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import logging
 import secrets
 import threading
 import time
@@ -56,8 +55,6 @@ from palpate.bus.zenoh_session import (
 from palpate.config import LinkConfig, check_name
 from palpate.errors import LinkError, PalpateError, WireError
 from palpate.process import Closing
-
-_log = logging.getLogger(__name__)
 
 _OBSERVER_WAIT_S = 1.0
 """How long a session that has joined looks for its router once more [s]."""
@@ -161,7 +158,6 @@ class Session(Closing):
         *,
         sensor: str = "*",
         service: str = "*",
-        instance: str = "*",
         station: str | None = None,
         delivery: Delivery = Delivery.NEWEST,
         capacity: int = 4096,
@@ -179,7 +175,7 @@ class Session(Closing):
         With ``NEWEST``, ``rehearse`` is called with the last message shortly before the next one is
         due, while a consumer waits: see ``Subscriber``.
         """
-        key = self._key(topic, sensor, service, instance, station)
+        key = self._key(topic, sensor, service, "*", station)
         return self._keep(
             Subscriber(
                 self._raw,
@@ -227,9 +223,9 @@ class Session(Closing):
         return str(self._raw.zid())
 
     @while_open()
-    def foreign_subscriber(self, key: str, *, capacity: int = 4096) -> ForeignSubscriber:
+    def foreign_subscriber(self, key: str) -> ForeignSubscriber:
         """Receive raw samples under a key expression that is not palpate's."""
-        return self._keep(ForeignSubscriber(self._raw, key, capacity=capacity))
+        return self._keep(ForeignSubscriber(self._raw, key))
 
     @while_open()
     def foreign_publisher(self, key: str) -> ForeignPublisher:
@@ -242,9 +238,9 @@ class Session(Closing):
         return self._keep(ForeignToken(self._raw, key))
 
     @while_open()
-    def foreign_tokens(self, key: str, *, timeout_s: float = 1.0) -> list[str]:
+    def foreign_tokens(self, key: str) -> list[str]:
         """Keys of the liveliness tokens that match a key expression that is not palpate's."""
-        replies = self._raw.liveliness().get(key, timeout=timeout_s)
+        replies = self._raw.liveliness().get(key, timeout=1.0)
         return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
     def queryable(

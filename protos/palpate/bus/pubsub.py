@@ -416,8 +416,8 @@ class Subscriber(Generic[M], Closing):
         took_s = min(time.monotonic() - began_s, _LEAD_MOST_S)
         self._rehearsal_s = max(took_s, self._rehearsal_s + 0.05 * (took_s - self._rehearsal_s))
 
-    def latest(self, max_age_s: float, *, sensor: str | None = None) -> ReceivedMessage[M]:
-        """The newest valid message (of a sensor), if it is not older than ``max_age_s``.
+    def latest(self, max_age_s: float) -> ReceivedMessage[M]:
+        """The newest valid message, if it is not older than ``max_age_s``.
 
         Nothing is consumed. The age counts from the stamp (when the sensor was read); it is never
         less than the time since this process saw the message. For ``NEWEST`` only: others keep
@@ -433,14 +433,10 @@ class Subscriber(Generic[M], Closing):
         check_process()
         with self._lock:
             self._look()
-            wanted = [
-                source
-                for source in self._sources.values()
-                if sensor is None or source.address.sensor == sensor
-            ]
-            valid = [source.newest for source in wanted if source.newest is not None]
+            sources = list(self._sources.values())
+            valid = [source.newest for source in sources if source.newest is not None]
         if not valid:
-            raise self._nothing(wanted)
+            raise self._nothing(sources)
         newest = max(valid, key=lambda message: message.received_monotonic_ns)
         age_s = self.age_s(newest)
         if age_s > max_age_s:

@@ -74,15 +74,13 @@ class QueryAnswer(Generic[R]):
         decode_s: How long its decoding took [s].
     """
 
-    def __init__(
-        self, query: zenoh.Query, key: str, codec: Codec[R], *, deadline_s: float = math.inf
-    ) -> None:
+    def __init__(self, query: zenoh.Query, key: str, codec: Codec[R]) -> None:
         self._query: zenoh.Query | None = query
         # A query may use wildcards; the reply names the key of the queryable that answers.
         self._key = key
         self._codec = codec
         self._lock = threading.Lock()
-        self.deadline_s = deadline_s
+        self.deadline_s = math.inf
         self.arrived_ns = time.monotonic_ns()
         self.decode_s = 0.0
 

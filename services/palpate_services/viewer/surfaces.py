@@ -85,9 +85,10 @@ def border_of(triangles: Ints) -> npt.NDArray[np.intp]:
     return border
 
 
-def core_mesh(segments: int = 32, rings: int = 12) -> tuple[FloatArray, np.ndarray, FloatArray]:
+def core_mesh() -> tuple[FloatArray, np.ndarray, FloatArray]:
     """Core as a mesh: vertices [m] ``(V, 3)``, triangles int32 ``(T, 3)``, normals ``(V, 3)``."""
-    profile_x, profile_r, normal_x, normal_r = _profile(_CORE_RADIUS_M, rings)
+    segments = 32
+    profile_x, profile_r, normal_x, normal_r = _profile(_CORE_RADIUS_M, 12)
     angle = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     around = np.stack([np.zeros_like(angle), np.cos(angle), np.sin(angle)], axis=1)
     axis = np.array([1.0, 0.0, 0.0])
@@ -105,16 +106,16 @@ def core_mesh(segments: int = 32, rings: int = 12) -> tuple[FloatArray, np.ndarr
     )
 
 
-def skin_lines(lines: int = 9, hoops: int = 7) -> list[FloatArray]:
+def skin_lines() -> list[FloatArray]:
     """Skin as a wire basket around pad and sides: polylines [m], each ``(n, 3)``."""
     profile_x, profile_r, _, _ = _profile(_SKIN_RADIUS_M, 16)
     spread = np.radians(115.0)
     drawn: list[FloatArray] = []
-    for angle in np.linspace(-spread, spread, lines):
+    for angle in np.linspace(-spread, spread, 9):
         y, z = np.sin(angle), -np.cos(angle)
         drawn.append(np.stack([profile_x, profile_r * y, profile_r * z], 1).astype(np.float32))
     around = np.linspace(-spread, spread, 41)
-    for x in np.linspace(_BACK_X_M, 0.0, hoops):
+    for x in np.linspace(_BACK_X_M, 0.0, 7):
         ring = [np.full_like(around, x), np.sin(around), -np.cos(around)]
         ring[1:] = [_SKIN_RADIUS_M * part for part in ring[1:]]
         drawn.append(np.stack(ring, 1).astype(np.float32))

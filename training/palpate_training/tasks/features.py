@@ -8,7 +8,6 @@ afterwards.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,8 +54,6 @@ from palpate_training.learning.metrics import (
 from palpate_training.learning.networks import predict, round_to_half, training_device
 from palpate_training.learning.ranges import ends_of, known_inputs, places_of
 from palpate_training.learning.splits import GUARD_S, Rows, RowSplit, by_group
-
-_log = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float32]
 OnEpoch = Callable[[str, int, int], None]

@@ -35,8 +35,6 @@ from palpate_training.tasks.results import (
     write_json,
 )
 
-FloatArray = npt.NDArray[np.float32]
-
 FORCE_CONFIG = FeaturesFitConfig()
 """Chosen on validation blocks only; training/LOG.md has what was tried."""
 
