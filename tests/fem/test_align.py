@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from palpate_fem.arrays import Floats
 from palpate_fem.calibration.alignment import (
     INCREMENTS,
     AlignmentError,
     AlignmentProblem,
     CostWeights,
-    Floats,
     ForceCurve,
     align,
     axis_rms_n,

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from palpate_fem.arrays import Floats
 from palpate_fem.calibration.alignment import (
     AlignedCurves,
     AlignmentError,
     AlignmentProblem,
-    Floats,
     ForceCurve,
     align,
     cost,

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from palpate.errors import ConfigError
+from palpate_fem.arrays import Floats
 from palpate_fem.calibration.alignment import (
     INCREMENTS,
     TARGET_THICKNESS_M,
     THRESHOLD_N,
     CostWeights,
-    Floats,
 )
 from palpate_fem.config import LIMITS, FingertipParameters
 

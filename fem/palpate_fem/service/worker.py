@@ -84,7 +84,7 @@ class Worker:
         def on_fraction(fraction: float) -> None:
             if should_stop() is not None:
                 raise _Stopped
-            self._tell()
+            self._tell(fraction)
 
         try:
             tip = tips.get(job.parameters, on_fraction)
@@ -109,7 +109,7 @@ class Worker:
             self._cancelled.clear()  # also of what came too late for an earlier job
         return JobEnded(done.outcome, done.reason, done.travel_m, done.seconds)
 
-    def _tell(self) -> None:
+    def _tell(self, _: float) -> None:
         """Report that the fluid is being filled in."""
         if time.monotonic() - self._reported > _REPORT_EVERY_S:
             self._reported = time.monotonic()
