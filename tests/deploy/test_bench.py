@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.errors import ConfigError
+from palpate.errors import ConfigError, LinkError
 from palpate.messages import COUNTS_MAX, ServiceState, Status
 from palpate_deploy.bench import alignment, codec, load, soak, swap
 from palpate_deploy.bench.e2e import Run
@@ -104,6 +104,21 @@ def test_the_latency_of_a_phase_leaves_out_what_came_before(tmp_path: Path) -> N
     assert fleet_latency(tmp_path / "out.npz", 1)["received"] == 6
     found = fleet_latency(tmp_path / "out.npz", 1, since_ns=3000)
     assert (found["received"], found["lost"]) == (3, 0)
+
+
+def test_a_station_that_falls_silent_has_lost_what_it_would_have_sent(tmp_path: Path) -> None:
+    """Two stations at 100 Hz for 2 s; one of them stops after half of it."""
+    arrived = [(name, n) for n in range(200) for name in ("a", "b") if name == "a" or n < 100]
+    rows = [(n, 10_000_000 * n, 10_000_000 * n + 1_000_000) for _, n in arrived]
+    write_rows(tmp_path / "out.npz", [name for name, _ in arrived], rows, dropped=0)
+    assert fleet_latency(tmp_path / "out.npz", 2)["lost"] == pytest.approx(100, abs=1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 20])
+def test_estimates_that_are_all_of_the_warm_up_have_no_latency(count: int) -> None:
+    rows = np.array([(n, 10**7 * n, 10**7 * n + 10**6) for n in range(count)], np.int64)
+    with pytest.raises(LinkError, match=f"{count} estimates came"):
+        latency(rows.reshape(-1, 3), warm_up=20, lost=0)
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ from palpate.errors import LinkError
 from palpate.process import cpu_time_s, resident_bytes
 from palpate_deploy.bench.harness import read_rows
 from palpate_deploy.bench.hosts import HostLab, LabHost
-from palpate_deploy.bench.results import finish, machine, write_result
+from palpate_deploy.bench.results import finish, machine, owed, write_result
 from palpate_deploy.station.certificates import issue, make_authority
 from palpate_deploy.station.lifetime import start_child, stop_child
 
@@ -203,9 +203,10 @@ def measure_scale(stations: int, seconds: float) -> dict[str, Any]:
 
 
 def _latency(out: Path, stations: int, *, since_ns: int = 0) -> dict[str, Any]:
-    """Latency of what a consumer took, and what was lost between its first and last message.
+    """Latency of what a consumer took, and what was lost since its first message.
 
-    Messages that came before ``since_ns`` [ns], host monotonic clock, are left out.
+    A station that fell silent before the others has lost what it would have sent. Messages that
+    came before ``since_ns`` [ns], host monotonic clock, are left out.
     """
     names, rows, _ = read_rows(out)
     names, rows = names[rows[:, 2] >= since_ns], rows[rows[:, 2] >= since_ns]
@@ -216,6 +217,7 @@ def _latency(out: Path, stations: int, *, since_ns: int = 0) -> dict[str, Any]:
     for station in set(names.tolist()):
         own = rows[names == station, 0]
         lost += int(own.max() - own.min() + 1 - len(set(own.tolist())))
+        lost += owed(np.sort(rows[names == station, 2]), int(rows[:, 2].max()))
     p50, p99 = np.percentile(ages_s, (50, 99))
     return {
         "p50_s": float(p50),

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -28,7 +27,7 @@ from palpate.errors import LinkError
 from palpate.messages import Status
 from palpate.process import cpu_time_s
 from palpate_deploy.bench.harness import read_rows
-from palpate_deploy.bench.results import finish, progress_bar
+from palpate_deploy.bench.results import finish, owed, progress_bar
 from palpate_deploy.bench.station import free_port, gateway_station, wait_ready
 from palpate_deploy.station.host import join, write_profile
 from palpate_deploy.station.processes import FiniteRun, command_line
@@ -37,9 +36,6 @@ from palpate_deploy.station.status import ask_status
 
 CORE_GOAL = 0.5
 """Share of a core that the gateway may use."""
-
-STOPPED_S = 0.5
-"""A sensor that sends nothing for so long before the end has stopped [s]."""
 
 _LOSSES = ("lost", "missing", "dropped", "parity", "overflow", "incomplete", "silences", "device_l")
 
@@ -121,8 +117,11 @@ def account(
     of_finger = np.array([str(name).startswith("finger") for name in names])
     for number in range(len(names)):
         mine = rows[rows[:, 0] == number]
-        lost += int((np.diff(mine[:, 1]) - 1).sum()) + _owed(mine[:, 4], end_ns)
+        lost += int((np.diff(mine[:, 1]) - 1).sum()) + owed(mine[:, 4], end_ns)
     lost += int(rows[:, 2].sum()) + int(rows[:, 5].sum())
+    for what, there in (("electrode", of_finger[rows[:, 0]]), ("wrench", ~of_finger[rows[:, 0]])):
+        if not there.any():
+            raise LinkError(f"no {what} frame came to the client", remedy="see the gateway's log")
     silent = 7 - len(np.unique(rows[:, 0]))
     late_s = (rows[:, 4] - rows[:, 3]) * 1e-9
     electrodes = late_s[of_finger[rows[:, 0]]]
@@ -150,14 +149,6 @@ def account(
         floor_p50_s=float(floor_p50),
         floor_p99_s=float(floor_p99),
     )
-
-
-def _owed(arrivals_ns: npt.NDArray[np.int64], end_ns: int) -> int:
-    """Frames that a sensor which has stopped would have sent until the end, at its rate so far."""
-    if not len(arrivals_ns) or (silent_ns := end_ns - arrivals_ns[-1]) < STOPPED_S * 1e9:
-        return 0
-    sent_ns = arrivals_ns[-1] - arrivals_ns[0]
-    return max(1, round((len(arrivals_ns) - 1) * silent_ns / sent_ns)) if sent_ns else 1
 
 
 def _longest(looks: Sequence[Status], gauge: str) -> float:

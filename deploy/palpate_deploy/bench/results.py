@@ -18,7 +18,7 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from palpate.errors import ConfigError
+from palpate.errors import ConfigError, LinkError
 from palpate_deploy.bench.harness import STAGES
 
 
@@ -38,11 +38,34 @@ def latency(rows: npt.NDArray[np.int64], *, warm_up: int, lost: int) -> Latency:
 
     ``warm_up`` estimates are left out after each pause: caches are cold, links slow. ``lost``
     frames got no estimate.
+
+    Raises:
+        LinkError: No estimate is left.
     """
-    kept = np.concatenate([part[warm_up:] for part in rounds(rows)])
+    kept = np.concatenate([rows[:0], *(part[warm_up:] for part in rounds(rows))])
+    if not len(kept):
+        raise LinkError(
+            f"{len(rows)} estimates came, none beyond the first {warm_up} after a pause",
+            remedy="measure for longer, or on a host that does nothing else",
+        )
     ages_s = (kept[:, 2] - kept[:, 1]) * 1e-9
     p50, p99 = np.percentile(ages_s, (50, 99))
     return Latency(float(p50), float(p99), float(ages_s.max()), len(ages_s), lost)
+
+
+STOPPED_S = 0.5
+"""A stream that is silent for so long before the end has stopped [s]."""
+
+
+def owed(arrivals_ns: npt.NDArray[np.int64], end_ns: int) -> int:
+    """Messages that a stream which has stopped would have sent until the end, at its rate so far.
+
+    Arrivals [ns] in order, shape ``(N,)``; of one whose rate is not known: 1, or 0 if none came.
+    """
+    if not len(arrivals_ns) or (silent_ns := end_ns - arrivals_ns[-1]) < STOPPED_S * 1e9:
+        return 0
+    sent_ns = arrivals_ns[-1] - arrivals_ns[0]
+    return max(1, round((len(arrivals_ns) - 1) * silent_ns / sent_ns)) if sent_ns else 1
 
 
 def rounds(rows: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
