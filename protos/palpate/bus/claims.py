@@ -34,8 +34,8 @@ from palpate.bus.topics import (
     claims_key,
     parse_claim_key,
 )
+from palpate.bus.zenoh_session import Declared
 from palpate.errors import ClaimedElsewhere, ReplicaDiffers, SensorTaken, StationTaken, WireError
-from palpate.process import Closing
 
 SETTLE_S = 0.2
 """For so long a sensor must have been free before it is taken [s]: by then each of two gateways
@@ -66,7 +66,7 @@ class _Own:
     new: bool = True  # never held, and nobody else was seen
 
 
-class SensorClaims(Closing):
+class SensorClaims(Declared):
     """The claims of one process. Safe to use from several threads; made by ``Session.claims``.
 
     Args:
@@ -100,7 +100,6 @@ class SensorClaims(Closing):
         self._own: dict[str, _Own] = {}
         self._others: dict[str, SensorClaim] = {}
         self._changed = threading.Condition(threading.RLock())
-        self._closed = False
         self._alive_s = time.monotonic()
         self._was_joined, self._blind_until_s = False, 0.0
         self._subscriber = self._liveliness.declare_subscriber(
@@ -171,7 +170,7 @@ class SensorClaims(Closing):
         """Whether a sensor is held, at once or within this time."""
         own = self._own[sensor]
         with self._changed:
-            self._changed.wait_for(lambda: own.claim.held or self._closed, timeout_s)
+            self._changed.wait_for(lambda: own.claim.held or self.closed, timeout_s)
             return own.claim.held
 
     def refusal(self, sensor: str) -> ClaimedElsewhere | None:
@@ -195,7 +194,7 @@ class SensorClaims(Closing):
             self._look()
             # Given up only because this process stood still, it is held again after a moment.
             self._changed.wait_for(
-                lambda: own.claim.held or own.rival is not None or self._closed, self.lease_s
+                lambda: own.claim.held or own.rival is not None or self.closed, self.lease_s
             )
             if not own.claim.held:
                 raise _taken(own.rival) if own.rival is not None else _unknown(own.claim)
@@ -210,7 +209,7 @@ class SensorClaims(Closing):
     def close(self) -> None:
         """Withdraw all claims."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._changed.notify_all()
         self._thread.join(timeout=2)
         with contextlib.suppress(zenoh.ZError):  # the session is gone, and the tokens with it
@@ -237,7 +236,7 @@ class SensorClaims(Closing):
 
     def _run(self) -> None:
         with self._changed:
-            while not self._closed:
+            while not self.closed:
                 try:
                     self._look()
                 except zenoh.ZError:  # the session is closing
@@ -331,7 +330,7 @@ MOST_CLAIMS = 1024
 """So many claims are remembered at most: anybody may declare tokens."""
 
 
-class ClaimWatch(Closing):
+class ClaimWatch(Declared):
     """Follows the claims that are held at a station (``"*"`` = any). Safe in several threads."""
 
     def __init__(self, session: zenoh.Session, station: str) -> None:
@@ -374,5 +373,6 @@ class ClaimWatch(Closing):
 
     def close(self) -> None:
         """Stop watching."""
+        self.closed = True
         with contextlib.suppress(zenoh.ZError):  # the session is gone
             self._subscriber.undeclare()

@@ -26,10 +26,9 @@ from palpate.bus.topics import (
     check_size,
     parse_key,
 )
-from palpate.bus.zenoh_session import check_process, while_open
+from palpate.bus.zenoh_session import Declared, check_process, while_open
 from palpate.errors import LinkError, StaleError, StreamTimeout, WireError
 from palpate.messages import StageTimings, Stamp
-from palpate.process import Closing
 
 MOST_SOURCES = 256
 """A subscriber follows so many sources at most: anybody may invent names."""
@@ -58,7 +57,7 @@ _PAUSE_LEAST_S, _PAUSE_MOST_S = 0.004, 0.05
 M = TypeVar("M")
 
 
-class Publisher(Generic[M], Closing):
+class Publisher(Generic[M], Declared):
     """Publishes one topic of one sensor or service. Made by ``Session.publisher``."""
 
     def __init__(
@@ -83,7 +82,6 @@ class Publisher(Generic[M], Closing):
             reliability=zenoh.Reliability.RELIABLE,
         )
         self._encode = topic.codec.encode
-        self._closed = False
 
     def encode(self, message: M) -> bytes:
         """Check and encode, for ``put_payload``.
@@ -112,7 +110,7 @@ class Publisher(Generic[M], Closing):
         check_process()
         check_size(payload, self.topic.codec.schema, remedy="publish a smaller message")
         try:
-            if self._closed:
+            if self.closed:
                 raise zenoh.ZError("the publisher is closed")
             self._publisher.put(payload, attachment=attachment)
         except (zenoh.ZError, RuntimeError) as error:  # RuntimeError: it is being undeclared
@@ -132,7 +130,7 @@ class Publisher(Generic[M], Closing):
 
     def close(self) -> None:
         """Undeclare; another thread that publishes gets a ``LinkError``."""
-        self._closed = True
+        self.closed = True
         undeclare(self._publisher)
 
 
@@ -254,7 +252,7 @@ class _Ringed:
         return sample, arrived_ns, 0
 
 
-class Subscriber(Generic[M], Closing):
+class Subscriber(Generic[M], Declared):
     """Receives one topic. Made by ``Session.subscriber``.
 
     Messages of each source are checked in order of arrival (``Continuity``). Safe to use from
@@ -601,4 +599,5 @@ class Subscriber(Generic[M], Closing):
 
     def close(self) -> None:
         """Undeclare; a blocked sender is released, and one that waits gets a ``LinkError``."""
+        self.closed = True
         self._arrivals.close()

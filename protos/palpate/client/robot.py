@@ -371,8 +371,11 @@ class Client(Closing):
         A gateway with the driver ``pose_zenoh``, whose option ``robot`` has the same name, turns
         them into poses of the indenter.
         """
-        self._publishers.append(RobotPosePublisher(self.session, check_name(robot, "robot")))
-        return self._publishers[-1]
+        publisher = RobotPosePublisher(self.session, check_name(robot, "robot"))
+        with self._lock:
+            self._publishers = [one for one in self._publishers if not one.closed]
+            self._publishers.append(publisher)
+        return publisher
 
     def tare(
         self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0, anyway: bool = False
