@@ -17,7 +17,7 @@ from palpate import clock
 from palpate.bus.attachments import timings_of
 from palpate.bus.continuity import Continuity
 from palpate.bus.delivery import Delivery, FifoQueue
-from palpate.bus.ring import Alarm, Ring, is_wake, undeclare
+from palpate.bus.ring import Alarm, Ring, is_wake, subscription_closed, undeclare
 from palpate.bus.topics import (
     Priority,
     StreamAddress,
@@ -204,6 +204,7 @@ class _Queued:
     ) -> None:
         self._waiting: FifoQueue[tuple[zenoh.Sample, int]] = waiting
         self._counters = counters
+        self._key = key
         self._subscriber = session.declare_subscriber(key, self._on_sample)
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
@@ -221,6 +222,8 @@ class _Queued:
 
     def wait(self, timeout_s: float) -> Arrival | None:
         item = self._waiting.get(timeout_s)
+        if item is None and self._waiting.closed:
+            raise subscription_closed(self._key)
         return None if item is None else (*item[0], item[1])
 
     def close(self) -> None:
@@ -362,10 +365,21 @@ class Subscriber(Generic[M], Declared):
         All that wait are taken. After the first, others are waited for during ``more_s``.
 
         Raises:
-            LinkError: The session was closed.
+            LinkError: The session was closed; with ``QUEUE`` and ``EVERY`` after the last message
+                that had arrived.
         """
         check_process()  # also before the locks: one that was held at a fork is never released
         taken: list[ReceivedMessage[M]] = []
+        try:
+            self._take(taken, timeout_s, most, more_s)
+        except LinkError:
+            if not taken:  # else the next call says it
+                raise
+        return taken
+
+    def _take(
+        self, taken: list[ReceivedMessage[M]], timeout_s: float, most: int, more_s: float
+    ) -> None:
         arrival: Arrival | None = None
         with self._one_reads():
             until_s = time.monotonic() + timeout_s
@@ -380,7 +394,7 @@ class Subscriber(Generic[M], Declared):
                     if taken and not had_some:
                         until_s = now_s + more_s if more_s else now_s
                     if len(taken) >= most or now_s >= until_s:
-                        return taken
+                        return
                     self._waits = True
                 ready_s = self._ready_s
                 if not now_s < ready_s < until_s:
