@@ -44,7 +44,7 @@ from palpate.client.simulations import (
     ask_cancellation,
     ask_simulation,
 )
-from palpate.client.streams import SameSensor, Stream
+from palpate.client.streams import SameSensor, Stream, check_depth
 from palpate.config import (
     STATION_VARIABLE,
     TlsConfig,
@@ -495,8 +495,7 @@ class Client(Closing):
     def _stream(
         self, topic: Topic[M], sensor: str, max_age_s: float, timeout_s: float | None, depth: int
     ) -> Stream[M]:
-        if depth < 1:
-            raise ConfigError(f"depth = {depth} keeps nothing", remedy="give 1 or more")
+        check_depth(depth)
         subscriber = self.session.subscriber(
             topic, sensor=check_name(sensor, "sensor"), delivery=Delivery.NEWEST, depth=depth
         )
