@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -16,16 +16,20 @@ from palpate.bus.topics import ELECTRODES, FEATURES
 from palpate.client import Client
 from palpate.config import LinkConfig
 from palpate.errors import LinkError, StreamTimeout
+from palpate.messages import Tare, TareRequest
 
 PATIENCE_S = 20.0
+
+
+def no_tare(request: TareRequest) -> Tare:
+    raise AssertionError(f"nobody asks: {request}")
+
 
 MADE: dict[str, Callable[[Session], Any]] = {
     "publisher": lambda session: session.publisher(ELECTRODES, sensor="finger"),
     "subscriber": lambda session: session.subscriber(FEATURES, sensor="finger"),
     "tap": lambda session: session.tap([FEATURES]),
-    "queryable": lambda session: session.queryable(
-        endpoints.TARE, lambda request: request, sensor="finger"
-    ),
+    "queryable": lambda session: session.queryable(endpoints.TARE, no_tare, sensor="finger"),
     "claims": lambda session: session.claims(instance="one", lease_s=2.0),
     "presence": lambda session: session.presence("features", instance="one"),
     "foreign publisher": lambda session: session.foreign_publisher("rt/force"),
@@ -35,7 +39,7 @@ MADE: dict[str, Callable[[Session], Any]] = {
 
 
 @pytest.fixture
-def alone() -> Any:
+def alone() -> Iterator[Session]:
     with Session.open(LinkConfig(connect=())) as session:
         yield session
 
