@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import math
 import os
 import secrets
 import stat
@@ -156,7 +157,14 @@ class CommandGuard:
         began_ns = now_ns - (time.monotonic_ns() - self._began_ns)
         if self._began_wall_ns - now_ns <= CLOCK_S * 1e9:
             began_ns = max(began_ns, self._began_wall_ns)
-        if abs(age_s) > CLOCK_S or command.wall_ns < began_ns:
+        if abs(age_s) <= CLOCK_S and command.wall_ns < began_ns:
+            wait_s = max(math.ceil((began_ns - now_ns) * 1e-9), 1)
+            _deny(
+                "the command was given before this process started, by this host's clock, which "
+                "perhaps was set back",
+                remedy=f"give it again in {wait_s} s",
+            )
+        if abs(age_s) > CLOCK_S:
             _deny(
                 f"the command was given {age_s:.0f} s ago by this host's clock, it holds for "
                 f"{CLOCK_S:g} s",

@@ -381,3 +381,35 @@ def test_joining_without_a_router_fails_and_may_be_cancelled(
         lambda: not [one for one in threading.enumerate() if one.name.startswith("palpate c")],
         timeout_s=LIVE_S,
     )
+
+
+def test_one_that_could_not_join_or_has_left_may_join_again(
+    link: LinkConfig, free_port: int, finger: Finger
+) -> None:
+    """Its threads had ended: a RuntimeError about futures was all that it said."""
+
+    async def scene() -> None:
+        lonely = AsyncClient(f"tcp/127.0.0.1:{free_port}", timeout_s=0.2)
+        for _ in range(2):
+            with pytest.raises(LinkError, match="no router"):
+                async with lonely:
+                    pass
+        robot = AsyncClient(link.connect[0], timeout_s=LIVE_S)
+        for _ in range(2):
+            async with robot:
+                await robot.features("finger", max_age_s=LIVE_S)
+                await anext(robot.stream_features("finger", max_age_s=LIVE_S))
+            with pytest.raises(LinkError, match="async with"):
+                await robot.features("finger")
+
+    asyncio.run(asyncio.wait_for(scene(), 5 * LIVE_S))
+
+
+@pytest.mark.parametrize("depth", [0, -1])
+def test_a_stream_that_would_keep_nothing_is_refused(link: LinkConfig, depth: int) -> None:
+    async def scene() -> None:
+        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
+            with pytest.raises(ConfigError, match="keeps nothing"):
+                robot.stream_features("finger", depth=depth)
+
+    asyncio.run(asyncio.wait_for(scene(), LIVE_S))

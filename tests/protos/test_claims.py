@@ -229,6 +229,38 @@ def test_of_two_that_could_not_see_each_other_the_older_holds(
             assert claims.refusal("finger") is None
 
 
+def test_a_flood_of_claims_is_bounded_and_hides_no_holder(
+    link: LinkConfig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """They were all kept, and looked through many times a second with the lock."""
+    most, flood = 20, 60
+    monkeypatch.setattr("palpate.bus.claims.MOST_CLAIMS", most)
+
+    def wait_until_ignored(count: int) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while sum("is ignored" in one.getMessage() for one in caplog.records) < count:
+            assert time.monotonic() < deadline, "none was ignored"
+            time.sleep(0.01)
+
+    with Session.open(link) as invents, ExitStack() as stack:
+        for number in range(flood):  # each comes before the holder of the finger
+            claim = SensorClaim("lab", f"s{number}", 1000 + number, True, 1)
+            invents.foreign_token(claim_key(claim))
+        first = stack.enter_context(claims_of(link, 2**62))
+        assert held_within_patience(first)
+        wait_until_ignored(flood - most)
+        caplog.clear()
+        session = stack.enter_context(Session.open(link))
+        other = session.claims(session_id=1, instance="other", lease_s=LEASE_S)
+        wait_until_ignored(flood + 1 - most)
+        assert not any(one.sensor == "finger" for one in other._others.values())
+        other.want("finger")
+        assert f"session {2**62:016x}" in str(refusal_of(other))
+        assert not other.wait("finger", 0.0)
+        assert len(other._others) <= most
+        first.check("finger")
+
+
 def test_without_a_link_nothing_is_taken(free_port: int) -> None:
     alone = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port}",))
     with claims_of(alone, 1) as claims:

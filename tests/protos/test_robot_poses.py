@@ -68,6 +68,9 @@ class Stalled:
         self.let_go.wait(PATIENCE_S)
         self.payloads.append(payload)
 
+    def close(self) -> None:
+        pass
+
 
 @pytest.mark.parametrize(
     ("position", "orientation", "time_ns", "reason"),

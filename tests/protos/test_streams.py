@@ -17,6 +17,7 @@ from palpate.bus.topics import ELECTRODES, TARE, sensor_key
 from palpate.codec import ELECTRODE_FRAME
 from palpate.config import LinkConfig
 from palpate.errors import (
+    LinkError,
     StaleError,
     StreamTimeout,
 )
@@ -282,3 +283,46 @@ def test_how_many_wait_is_known(
     stream.next(PATIENCE_S)
     tap.next(PATIENCE_S)
     assert (stream.waiting, tap.waiting) == (2, 2)
+
+
+@pytest.mark.parametrize("delivery", Delivery)
+@pytest.mark.parametrize("closed", ["stream", "session"])
+def test_one_that_waits_is_told_that_it_is_closed(delivery: Delivery, closed: str) -> None:
+    """With ``QUEUE`` and ``EVERY`` it waited on, and then said that nothing had come."""
+    with Session.open(LinkConfig(connect=())) as session:
+        stream = session.subscriber(ELECTRODES, delivery=delivery)
+        waits = threading.Event()
+        told: list[Exception] = []
+
+        def wait() -> None:
+            waits.set()
+            try:
+                stream.next(PATIENCE_S)
+            except Exception as error:
+                told.append(error)
+
+        thread = threading.Thread(target=wait)
+        thread.start()
+        assert waits.wait(PATIENCE_S)
+        (stream if closed == "stream" else session).close()
+        thread.join(2 * PATIENCE_S)
+        assert [type(one) for one in told] == [LinkError]
+        with pytest.raises(LinkError, match="closed"):
+            stream.next(0.0)
+
+
+def test_a_tap_is_emptied_after_it_was_closed(
+    pair: tuple[Session, Session], frame_of: FrameOf, wait_until: WaitUntil
+) -> None:
+    a, b = pair
+    tap = b.tap([ELECTRODES])
+    publisher = a.publisher(ELECTRODES, sensor="finger")
+    wait_until(publisher.matched)
+    for sequence in (1, 2):
+        publisher.put(frame_of(sequence))
+    wait_until(lambda: tap.waiting == 2)
+    tap.close()
+    for _ in range(2):
+        assert tap.next(0.0).sensor == "finger"
+    with pytest.raises(StreamTimeout):
+        tap.next(0.0)

@@ -17,7 +17,7 @@ from palpate.bus.pubsub import Subscriber
 from palpate.bus.ring import Alarm
 from palpate.bus.tap import Tap
 from palpate.bus.topics import ELECTRODES, sensor_key
-from palpate.errors import StaleError, StreamTimeout
+from palpate.errors import LinkError, StaleError, StreamTimeout
 from palpate.messages import ElectrodeFrame, Origin
 
 FrameOf = Callable[..., ElectrodeFrame]
@@ -91,6 +91,23 @@ def test_a_full_queue_counts_what_it_refuses_of_each_key() -> None:
     waiting.put("b", 11)
     assert [waiting.get(0.0), waiting.get(0.0)] == [(4, 2), (11, 1)]
     assert counters == {"overflow": 3}
+
+
+@pytest.mark.parametrize("delivery", [Delivery.QUEUE, Delivery.EVERY])
+@pytest.mark.parametrize("timeout_s", [0.0, 20.0])
+def test_what_had_arrived_is_taken_before_the_end_is_told(
+    delivery: Delivery, timeout_s: float, frame_of: FrameOf
+) -> None:
+    bus = Bus(delivery)
+    for sequence in (1, 2, 3):
+        bus.send(frame_of(sequence))
+    bus.subscriber.close()
+    assert bus.come(1) == [1]
+    left = bus.subscriber.next_batch(timeout_s, more_s=timeout_s)
+    assert [one.message.stamp.sequence for one in left] == [2, 3]
+    for _ in range(2):
+        with pytest.raises(LinkError, match="closed"):
+            bus.subscriber.next(timeout_s)
 
 
 @pytest.mark.parametrize("delivery", [Delivery.NEWEST, Delivery.QUEUE])

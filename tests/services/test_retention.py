@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from pathlib import Path
@@ -106,6 +107,26 @@ def test_nothing_else_is_ever_removed(tmp_path: Path) -> None:
     kept.apply()
     assert left(tmp_path) == before
     assert health.counters.get("removed_records", 0) == 0
+
+
+def test_a_record_that_cannot_be_read_for_a_moment_is_looked_at_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It counted as somebody else's until the recorder was started again, and the disk filled."""
+    old = record(tmp_path, name_of(1), age_s=50.0)
+    record(tmp_path, name_of(2))
+    kept, health = keeper(tmp_path, keep_bytes=150_000)
+
+    def refuse(path: Path) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    with monkeypatch.context() as many_open:
+        many_open.setattr("palpate.files.record.open_regular", refuse)
+        kept.apply()
+    assert old.exists()
+    kept.apply()
+    assert left(tmp_path) == [name_of(2)]
+    assert health.counters["removed_records"] == 1
 
 
 def test_what_was_cut_off_and_recovered_counts_too(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from palpate.bus import Delivery, Session
 from palpate.bus.topics import STATUS
 from palpate.census import ROUTER, ProcessName, ProcessReport, take_census
-from palpate.errors import PalpateError, StreamTimeout
+from palpate.errors import LinkError, StreamTimeout
 from palpate.messages import Status
 from palpate.process import Closing
 
@@ -127,8 +127,8 @@ class StationObserver(Closing):
                 self._hear(self._statuses.next(_POLL_S).message)
             except StreamTimeout:
                 continue
-            except PalpateError:  # a status that breaks the contract says nothing
-                continue
+            except LinkError:  # the session is closed
+                return
 
     def _hear(self, status: Status) -> None:
         name = status.service, status.instance

@@ -34,8 +34,8 @@ from palpate.bus.topics import (
     claims_key,
     parse_claim_key,
 )
+from palpate.bus.zenoh_session import Declared
 from palpate.errors import ClaimedElsewhere, ReplicaDiffers, SensorTaken, StationTaken, WireError
-from palpate.process import Closing
 
 SETTLE_S = 0.2
 """For so long a sensor must have been free before it is taken [s]: by then each of two gateways
@@ -49,6 +49,10 @@ YIELD_S = 0.5
 """Of two that hold one sensor, the later one gives it up after this time [s]; one that stood still
 notices that itself, sooner."""
 
+MOST_CLAIMS = 1024
+"""So many claims are remembered at most: anybody may declare tokens."""
+
+_ASK_S = 1.0
 _LOOK_S = 0.05
 _SETTLED_LOOK_S = 0.5  # of one that holds all it wants: a rival's token wakes it
 
@@ -66,7 +70,7 @@ class _Own:
     new: bool = True  # never held, and nobody else was seen
 
 
-class SensorClaims(Closing):
+class SensorClaims(Declared):
     """The claims of one process. Safe to use from several threads; made by ``Session.claims``.
 
     Args:
@@ -99,8 +103,8 @@ class SensorClaims(Closing):
         self._joined = joined
         self._own: dict[str, _Own] = {}
         self._others: dict[str, SensorClaim] = {}
+        self._ignored = False
         self._changed = threading.Condition(threading.RLock())
-        self._closed = False
         self._alive_s = time.monotonic()
         self._was_joined, self._blind_until_s = False, 0.0
         self._subscriber = self._liveliness.declare_subscriber(
@@ -171,7 +175,7 @@ class SensorClaims(Closing):
         """Whether a sensor is held, at once or within this time."""
         own = self._own[sensor]
         with self._changed:
-            self._changed.wait_for(lambda: own.claim.held or self._closed, timeout_s)
+            self._changed.wait_for(lambda: own.claim.held or self.closed, timeout_s)
             return own.claim.held
 
     def refusal(self, sensor: str) -> ClaimedElsewhere | None:
@@ -195,7 +199,7 @@ class SensorClaims(Closing):
             self._look()
             # Given up only because this process stood still, it is held again after a moment.
             self._changed.wait_for(
-                lambda: own.claim.held or own.rival is not None or self._closed, self.lease_s
+                lambda: own.claim.held or own.rival is not None or self.closed, self.lease_s
             )
             if not own.claim.held:
                 raise _taken(own.rival) if own.rival is not None else _unknown(own.claim)
@@ -210,7 +214,7 @@ class SensorClaims(Closing):
     def close(self) -> None:
         """Withdraw all claims."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._changed.notify_all()
         self._thread.join(timeout=2)
         with contextlib.suppress(zenoh.ZError):  # the session is gone, and the tokens with it
@@ -232,12 +236,37 @@ class SensorClaims(Closing):
             if sample.kind == zenoh.SampleKind.DELETE:
                 self._others.pop(key, None)
             else:
-                self._others[key] = claim
+                self._remember(key, claim)
             self._changed.notify_all()
+
+    def _remember(self, key: str, claim: SensorClaim) -> None:
+        """With the lock. Of too many those are ignored that are least likely to come first."""
+        self._others[key] = claim
+        if len(self._others) > MOST_CLAIMS:
+            last = max(
+                self._others,
+                key=lambda one: (
+                    self._others[one].sensor not in self._own,
+                    self._others[one].order,
+                ),
+            )
+            del self._others[last]
+            self._ignored = True
+            _log.warning("more than %d claims on sensors: %s is ignored", MOST_CLAIMS, last)
+
+    def _ask(self, sensor: str) -> None:
+        """Who claims a sensor, where some claims were ignored; with the lock."""
+        key = claims_key(self._station, sensor, root=self._root)
+        for reply in self._liveliness.get(key, timeout=_ASK_S):
+            with contextlib.suppress(WireError):  # anybody may declare tokens
+                if reply.ok is not None:
+                    claim = parse_claim_key(found := str(reply.ok.key_expr))
+                    if claim.session_id != self._session_id:
+                        self._remember(found, claim)
 
     def _run(self) -> None:
         with self._changed:
-            while not self._closed:
+            while not self.closed:
                 try:
                     self._look()
                 except zenoh.ZError:  # the session is closing
@@ -256,16 +285,23 @@ class SensorClaims(Closing):
             if stood_still and own.claim.held:
                 _log.warning("this process stood still: who publishes %s?", own.claim.sensor)
                 self._become(own, held=False)
-            others = [one for one in self._others.values() if self._excludes(one, own.claim)]
-            first = min(others, key=lambda one: one.order, default=own.claim)
-            own.rival = first if first.order < own.claim.order else None
+            own.rival = self._rival_of(own.claim)
             may_change = (own.rival is None) != own.claim.held
             if not may_change or not (own.claim.held or sees):
                 own.since_s = None
             elif own.since_s is None or stood_still:
                 own.since_s = now_s
             elif now_s - own.since_s >= (YIELD_S if own.claim.held else SETTLE_S):
-                self._become(own, held=not own.claim.held)
+                if self._ignored and not own.claim.held:
+                    self._ask(own.claim.sensor)
+                    own.rival = self._rival_of(own.claim)
+                if own.rival is None or own.claim.held:
+                    self._become(own, held=not own.claim.held)
+
+    def _rival_of(self, own: SensorClaim) -> SensorClaim | None:
+        others = [one for one in self._others.values() if self._excludes(one, own)]
+        first = min(others, key=lambda one: one.order, default=own)
+        return first if first.order < own.order else None
 
     def _excludes(self, other: SensorClaim, own: SensorClaim) -> bool:
         """Whether only one of two claims can be held."""
@@ -327,11 +363,7 @@ def _unknown(claim: SensorClaim) -> ClaimedElsewhere:
     )
 
 
-MOST_CLAIMS = 1024
-"""So many claims are remembered at most: anybody may declare tokens."""
-
-
-class ClaimWatch(Closing):
+class ClaimWatch(Declared):
     """Follows the claims that are held at a station (``"*"`` = any). Safe in several threads."""
 
     def __init__(self, session: zenoh.Session, station: str) -> None:
@@ -374,5 +406,6 @@ class ClaimWatch(Closing):
 
     def close(self) -> None:
         """Stop watching."""
+        self.closed = True
         with contextlib.suppress(zenoh.ZError):  # the session is gone
             self._subscriber.undeclare()

@@ -98,13 +98,13 @@ class FifoQueue(Generic[T]):
         self._capacity = capacity
         self._sender_waits = sender_waits
         self._changed = threading.Condition()
-        self._closed = False
+        self.closed = False
         self._counters = counters
 
     def put(self, key: str, item: T) -> None:
         """Add an item; blocks while the queue is full only if the sender shall wait."""
         with self._changed:
-            while self._sender_waits and len(self._items) >= self._capacity and not self._closed:
+            while self._sender_waits and len(self._items) >= self._capacity and not self.closed:
                 self._changed.wait(0.5)
             if len(self._items) >= self._capacity:
                 if key in self._lost or len(self._lost) < MOST_KEYS:
@@ -115,9 +115,13 @@ class FifoQueue(Generic[T]):
             self._changed.notify_all()
 
     def get(self, timeout_s: float) -> tuple[T, int] | None:
-        """Next item, and how many of its key were dropped before it; None = none in time."""
+        """Next item, and how many of its key were dropped before it.
+
+        None = none in time, or it is closed; what waited then can still be taken.
+        """
         with self._changed:
-            if not self._changed.wait_for(lambda: bool(self._items), timeout_s):
+            self._changed.wait_for(lambda: self._items or self.closed, timeout_s)
+            if not self._items:
                 return None
             item = self._items.popleft()
             if self._sender_waits:
@@ -129,9 +133,9 @@ class FifoQueue(Generic[T]):
         return len(self._items)
 
     def close(self) -> None:
-        """Release a sender that waits."""
+        """Release a sender and a consumer that wait."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._changed.notify_all()
 
 

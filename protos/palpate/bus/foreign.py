@@ -13,8 +13,8 @@ import zenoh
 
 from palpate.bus.delivery import FifoQueue
 from palpate.bus.ring import is_wake, undeclare
+from palpate.bus.zenoh_session import Declared
 from palpate.errors import LinkError, StreamTimeout
-from palpate.process import Closing
 
 
 class ForeignSample(NamedTuple):
@@ -37,7 +37,7 @@ _WAITING_MOST = 4096
 """Samples that may wait."""
 
 
-class ForeignSubscriber(Closing):
+class ForeignSubscriber(Declared):
     """Samples of a key expression, first in, first out. Made by ``Session.foreign_subscriber``."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
@@ -82,11 +82,12 @@ class ForeignSubscriber(Closing):
 
     def close(self) -> None:
         """Undeclare."""
+        self.closed = True
         self._waiting.close()
         undeclare(self._subscriber)
 
 
-class ForeignPublisher(Closing):
+class ForeignPublisher(Declared):
     """Publishes bytes on one key; drops rather than block. Made by ``Session``."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
@@ -110,10 +111,11 @@ class ForeignPublisher(Closing):
 
     def close(self) -> None:
         """Undeclare."""
+        self.closed = True
         undeclare(self._publisher)
 
 
-class ForeignToken(Closing):
+class ForeignToken(Declared):
     """A liveliness token with a key of another system."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
@@ -121,4 +123,5 @@ class ForeignToken(Closing):
 
     def close(self) -> None:
         """Withdraw it."""
+        self.closed = True
         undeclare(self._token)

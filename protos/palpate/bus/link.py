@@ -46,6 +46,7 @@ from palpate.bus.topics import (
     service_key,
 )
 from palpate.bus.zenoh_session import (
+    Declared,
     check_process,
     close_zenoh,
     is_inherited,
@@ -73,7 +74,7 @@ Q = TypeVar("Q")
 R = TypeVar("R")
 
 
-K = TypeVar("K", bound=Closing)
+K = TypeVar("K", bound=Declared)
 
 
 _open: weakref.WeakSet[Session] = weakref.WeakSet()
@@ -107,9 +108,11 @@ class Session(Closing):
         self._claim_watches: dict[str, ClaimWatch] = {}
         self._observing: Session | None = None
         self._observing_lock = threading.Lock()
+        self._declaring = threading.Lock()
+        self._declared: list[Declared] = []
         self._answering: list[Queryable] = []
+        self._answered: Counter[str] = Counter()  # of those that do not answer any more
         _open.add(self)
-        self._closing: list[Callable[[], None]] = []
 
     @classmethod
     def open(cls, link: LinkConfig, *, station: str = "lab") -> Self:
@@ -284,15 +287,26 @@ class Session(Closing):
         key = self._key(endpoint, sensor, service, instance)
         queryable = Queryable(self._raw, key, endpoint, handler, capacity=capacity, workers=workers)
         if endpoint is not STATUS:
-            self._answering.append(queryable)
+            with self._declaring:
+                self._sum_up_answered()
+                self._answering.append(queryable)
         return self._keep(queryable)
 
     def questions(self) -> tuple[dict[str, int], int]:
         """Counters of all questions to this session but those about its status; how many wait."""
-        counters: Counter[str] = Counter()
-        for queryable in self._answering:
-            counters.update(queryable.counters)
-        return dict(counters), sum(one.waiting for one in self._answering)
+        with self._declaring:
+            self._sum_up_answered()
+            counters = self._answered.copy()
+            for queryable in self._answering:
+                counters.update(queryable.counters)
+            return dict(counters), sum(one.waiting for one in self._answering)
+
+    def _sum_up_answered(self) -> None:
+        """Keep only the counters of what is closed; with the lock."""
+        for one in self._answering:
+            if one.closed:
+                self._answered.update(one.counters)
+        self._answering = [one for one in self._answering if not one.closed]
 
     def query(
         self,
@@ -500,7 +514,7 @@ class Session(Closing):
             if self._observing is None:
                 update = {"direct": False, "wait_for_router_s": _OBSERVER_WAIT_S}
                 link = self._link.model_copy(update=update)
-                self._observing = self._keep(Session.open(link, station=self.station))
+                self._observing = Session.open(link, station=self.station)
             return self._observing
 
     def _asking(self) -> zenoh.Session:
@@ -528,17 +542,20 @@ class Session(Closing):
 
     def close(self) -> None:
         """Leave the bus; takes up to 10 s where the router hangs. In a forked process: nothing."""
-        _open.discard(self)
-        if is_inherited():
-            return
-        for close in reversed(self._closing):
-            with contextlib.suppress(zenoh.ZError):  # already undeclared, or the session is gone
-                close()
-        self._closing.clear()
-        close_zenoh(self._raw)
+        if not is_inherited():
+            for one in reversed(self._declared):
+                with contextlib.suppress(zenoh.ZError):  # undeclared before, or the session is gone
+                    one.close()
+            self._declared.clear()
+            if self._observing is not None:
+                self._observing.close()
+            close_zenoh(self._raw)
+        _open.discard(self)  # last: after Ctrl-C in here it is closed at the end of the process
 
     def _keep(self, thing: K) -> K:
-        self._closing.append(thing.close)
+        with self._declaring:
+            self._declared = [one for one in self._declared if not one.closed]
+            self._declared.append(thing)
         return thing
 
     def _key(

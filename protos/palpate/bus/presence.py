@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import zenoh
 
 from palpate.bus.topics import live_key
+from palpate.bus.zenoh_session import Declared
 from palpate.process import Closing
 
 _LOOK_S = 1.0
@@ -27,7 +28,7 @@ class AliveService:
     ready: bool
 
 
-class Presence(Closing):
+class Presence(Declared):
     """Declares that this process is alive and, after ``ready``, that it serves.
 
     Other processes see both end within milliseconds when this process dies, and within the lease
@@ -53,6 +54,7 @@ class Presence(Closing):
 
     def close(self) -> None:
         """Withdraw both."""
+        self.closed = True
         self.not_ready()
         self._alive.undeclare()
 
@@ -96,7 +98,7 @@ class CallerToken(Closing):
             self._token.undeclare()
 
 
-class CallerWatch(Closing):
+class CallerWatch(Declared):
     """Calls ``on_gone``, in a thread of its own, for every token that has vanished.
 
     It gets the token's key and when it vanished [s, monotonic]. A caller that asks again with the
@@ -133,6 +135,7 @@ class CallerWatch(Closing):
 
     def close(self) -> None:
         """Stop watching."""
+        self.closed = True
         self._subscriber.undeclare()
         self._vanished.put(None)
         self._worker.join(timeout=2)

@@ -17,7 +17,7 @@ from palpate import clock
 from palpate.bus.attachments import timings_of
 from palpate.bus.continuity import Continuity
 from palpate.bus.delivery import Delivery, FifoQueue
-from palpate.bus.ring import Alarm, Ring, is_wake, undeclare
+from palpate.bus.ring import Alarm, Ring, is_wake, subscription_closed, undeclare
 from palpate.bus.topics import (
     Priority,
     StreamAddress,
@@ -26,10 +26,9 @@ from palpate.bus.topics import (
     check_size,
     parse_key,
 )
-from palpate.bus.zenoh_session import check_process, while_open
+from palpate.bus.zenoh_session import Declared, check_process, while_open
 from palpate.errors import LinkError, StaleError, StreamTimeout, WireError
 from palpate.messages import StageTimings, Stamp
-from palpate.process import Closing
 
 MOST_SOURCES = 256
 """A subscriber follows so many sources at most: anybody may invent names."""
@@ -58,7 +57,7 @@ _PAUSE_LEAST_S, _PAUSE_MOST_S = 0.004, 0.05
 M = TypeVar("M")
 
 
-class Publisher(Generic[M], Closing):
+class Publisher(Generic[M], Declared):
     """Publishes one topic of one sensor or service. Made by ``Session.publisher``."""
 
     def __init__(
@@ -83,7 +82,6 @@ class Publisher(Generic[M], Closing):
             reliability=zenoh.Reliability.RELIABLE,
         )
         self._encode = topic.codec.encode
-        self._closed = False
 
     def encode(self, message: M) -> bytes:
         """Check and encode, for ``put_payload``.
@@ -112,7 +110,7 @@ class Publisher(Generic[M], Closing):
         check_process()
         check_size(payload, self.topic.codec.schema, remedy="publish a smaller message")
         try:
-            if self._closed:
+            if self.closed:
                 raise zenoh.ZError("the publisher is closed")
             self._publisher.put(payload, attachment=attachment)
         except (zenoh.ZError, RuntimeError) as error:  # RuntimeError: it is being undeclared
@@ -132,7 +130,7 @@ class Publisher(Generic[M], Closing):
 
     def close(self) -> None:
         """Undeclare; another thread that publishes gets a ``LinkError``."""
-        self._closed = True
+        self.closed = True
         undeclare(self._publisher)
 
 
@@ -206,6 +204,7 @@ class _Queued:
     ) -> None:
         self._waiting: FifoQueue[tuple[zenoh.Sample, int]] = waiting
         self._counters = counters
+        self._key = key
         self._subscriber = session.declare_subscriber(key, self._on_sample)
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
@@ -223,6 +222,8 @@ class _Queued:
 
     def wait(self, timeout_s: float) -> Arrival | None:
         item = self._waiting.get(timeout_s)
+        if item is None and self._waiting.closed:
+            raise subscription_closed(self._key)
         return None if item is None else (*item[0], item[1])
 
     def close(self) -> None:
@@ -254,7 +255,7 @@ class _Ringed:
         return sample, arrived_ns, 0
 
 
-class Subscriber(Generic[M], Closing):
+class Subscriber(Generic[M], Declared):
     """Receives one topic. Made by ``Session.subscriber``.
 
     Messages of each source are checked in order of arrival (``Continuity``). Safe to use from
@@ -364,10 +365,21 @@ class Subscriber(Generic[M], Closing):
         All that wait are taken. After the first, others are waited for during ``more_s``.
 
         Raises:
-            LinkError: The session was closed.
+            LinkError: The session was closed; with ``QUEUE`` and ``EVERY`` after the last message
+                that had arrived.
         """
         check_process()  # also before the locks: one that was held at a fork is never released
         taken: list[ReceivedMessage[M]] = []
+        try:
+            self._take(taken, timeout_s, most, more_s)
+        except LinkError:
+            if not taken:  # else the next call says it
+                raise
+        return taken
+
+    def _take(
+        self, taken: list[ReceivedMessage[M]], timeout_s: float, most: int, more_s: float
+    ) -> None:
         arrival: Arrival | None = None
         with self._one_reads():
             until_s = time.monotonic() + timeout_s
@@ -382,7 +394,7 @@ class Subscriber(Generic[M], Closing):
                     if taken and not had_some:
                         until_s = now_s + more_s if more_s else now_s
                     if len(taken) >= most or now_s >= until_s:
-                        return taken
+                        return
                     self._waits = True
                 ready_s = self._ready_s
                 if not now_s < ready_s < until_s:
@@ -601,4 +613,5 @@ class Subscriber(Generic[M], Closing):
 
     def close(self) -> None:
         """Undeclare; a blocked sender is released, and one that waits gets a ``LinkError``."""
+        self.closed = True
         self._arrivals.close()

@@ -21,10 +21,10 @@ import zenoh
 from palpate.bus.attachments import deadline_of
 from palpate.bus.endpoints import Endpoint
 from palpate.bus.topics import ENCODING_PREFIX, check_schema, check_size
+from palpate.bus.zenoh_session import Declared
 from palpate.codec import ERROR, STAGE_TIMINGS, Codec
 from palpate.errors import ErrorCode, PalpateError, RemoteError, WireError
 from palpate.messages import ErrorReply, StageTimings
-from palpate.process import Closing
 
 Q = TypeVar("Q")
 R = TypeVar("R")
@@ -133,7 +133,7 @@ class QueryAnswer(Generic[R]):
             self._query = None
 
 
-class Queryable(Closing):
+class Queryable(Declared):
     """Gives each question and its ``QueryAnswer`` to ``handler``, in threads of its own.
 
     The handler may return before the answer has ended, and may end it from another thread. An
@@ -291,6 +291,7 @@ class Queryable(Closing):
 
     def close(self) -> None:
         """Undeclare; what was accepted is still handled, or refused if that takes too long."""
+        self.closed = True
         self._queryable.undeclare()
         for _ in self._workers:
             self._waiting.put(None)

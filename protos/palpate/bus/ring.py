@@ -16,7 +16,7 @@ from typing import Protocol
 
 import zenoh
 
-from palpate.bus.zenoh_session import is_inherited
+from palpate.bus.zenoh_session import Declared, is_inherited
 from palpate.errors import LinkError
 from palpate.process import Closing
 
@@ -62,14 +62,21 @@ def undeclare(declared: _Declared) -> None:
                 time.sleep(0.001)
 
 
+def subscription_closed(key: str) -> LinkError:
+    """What a subscriber says to those who take messages after it was closed."""
+    return LinkError(f"the subscription to {key} is closed", remedy="open the session again")
+
+
 class _Sleeper(Protocol):
-    """What an alarm wakes."""
+    """What an alarm wakes, until it is closed."""
+
+    closed: bool
 
     def wake(self) -> None:
         """End the wait."""
 
 
-class Alarm(Closing):
+class Alarm(Declared):
     """Wakes those who wait, each at its deadline: one thread for a session. Thread-safe."""
 
     def __init__(self) -> None:
@@ -77,15 +84,16 @@ class Alarm(Closing):
         self._next_s = math.inf
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
-        self._closed = False
 
     def set(self, sleeper: _Sleeper, deadline_s: float) -> None:
         """Wake a sleeper at an instant [s, monotonic]; inf = not any more."""
         # Usually the thread sleeps until an earlier instant already, and nothing is locked.
         self._deadlines[sleeper] = deadline_s
-        if deadline_s < self._next_s:
+        if sleeper.closed:  # perhaps after it was forgotten, by a wait that ended
+            self.forget(sleeper)
+        elif deadline_s < self._next_s:
             with self._changed:
-                if self._thread is None and not self._closed:
+                if self._thread is None and not self.closed:
                     self._thread = threading.Thread(target=self._run, name="alarm", daemon=True)
                     self._thread.start()
                 self._changed.notify()
@@ -96,11 +104,11 @@ class Alarm(Closing):
 
     def _run(self) -> None:
         with self._changed:
-            while not self._closed:
+            while not self.closed:
                 now_s, look_s = time.monotonic(), math.inf
                 for sleeper, deadline_s in list(self._deadlines.items()):
                     if deadline_s <= now_s:
-                        self._deadlines[sleeper] = math.inf
+                        self.set(sleeper, math.inf)
                         sleeper.wake()
                         # It soon sets its next alarm, and need not wake this thread for that.
                         look_s = now_s + _LOOK_S
@@ -118,7 +126,7 @@ class Alarm(Closing):
     def close(self) -> None:
         """End the thread; nobody is woken any more."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._changed.notify()
         if self._thread is not None:
             self._thread.join(timeout=2)
@@ -134,6 +142,7 @@ class Ring(Closing):
         self.capacity = capacity
         self._session = session
         self._key = key
+        self.closed = False
         self._wake_key = key.replace("*", "wake")
         self._alarm = alarm
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(capacity))
@@ -150,7 +159,7 @@ class Ring(Closing):
                 if not is_wake(sample):
                     return sample
         except zenoh.ZError as error:
-            raise self._closed() from error
+            raise subscription_closed(self._key) from error
         return None
 
     def wait(self, timeout_s: float) -> zenoh.Sample | None:
@@ -168,14 +177,9 @@ class Ring(Closing):
                 self._alarm.set(self, deadline_s)
             return sample
         except zenoh.ZError as error:
-            raise self._closed() from error
+            raise subscription_closed(self._key) from error
         finally:
             self._alarm.set(self, math.inf)
-
-    def _closed(self) -> LinkError:
-        return LinkError(
-            f"the subscription to {self._key} is closed", remedy="open the session again"
-        )
 
     def wake(self) -> None:
         """End a wait."""
@@ -191,5 +195,6 @@ class Ring(Closing):
 
     def close(self) -> None:
         """Undeclare; one that waits gets a ``LinkError``."""
+        self.closed = True
         self._alarm.forget(self)
         undeclare(self._subscriber)

@@ -13,8 +13,8 @@ from palpate import clock
 from palpate.bus.delivery import Delivery, DeliveryQueue, queue_for
 from palpate.bus.ring import is_wake, undeclare
 from palpate.bus.topics import parse_key
+from palpate.bus.zenoh_session import Declared
 from palpate.errors import StreamTimeout, WireError
-from palpate.process import Closing
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class TapSample:
         return self.encoding.partition(";")[2]
 
 
-class Tap(Closing):
+class Tap(Declared):
     """Receives undecoded samples of several topics in order of arrival. Made by ``Session.tap``."""
 
     def __init__(
@@ -109,6 +109,7 @@ class Tap(Closing):
 
     def close(self) -> None:
         """Undeclare; a blocked sender is released."""
+        self.closed = True
         self._waiting.close()
         for subscriber in self._subscribers:
             undeclare(subscriber)

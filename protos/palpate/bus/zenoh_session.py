@@ -19,6 +19,7 @@ from palpate.bus.topics import (
 )
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, LinkError
+from palpate.process import Closing
 
 _log = logging.getLogger(__name__)
 
@@ -152,6 +153,13 @@ def check_process() -> None:
             remedy='start processes with multiprocessing.get_context("spawn"), or open the client '
             "in the child only",
         )
+
+
+class Declared(Closing):
+    """What a session has declared: closed with it, and forgotten by it if it was closed before."""
+
+    closed = False
+    """Whether it was closed."""
 
 
 @contextlib.contextmanager

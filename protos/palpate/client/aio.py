@@ -21,7 +21,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar
 from palpate.bus import Cancellation
 from palpate.bus.zenoh_session import check_process, is_inherited
 from palpate.client.robot import Client
-from palpate.client.streams import Stream, Watch
+from palpate.client.streams import Stream, Watch, check_depth
 from palpate.config import TlsConfig
 from palpate.errors import LinkError, PalpateError, SensorChanged
 
@@ -165,6 +165,7 @@ def _streaming(
     def call(client: AsyncClient, /, *args: P.args, **options: P.kwargs) -> AsyncStream[M]:
         depth = options.get("depth", 1)
         assert isinstance(depth, int)
+        check_depth(depth)
         sync = client.sync
         stream = AsyncStream(client, lambda: method(sync, *args, **options), depth)
         client.keep(stream)
@@ -182,7 +183,8 @@ class AsyncClient:
             async for estimate in robot.stream_features("finger"):
                 print(estimate.force)
 
-    Arguments are those of ``Client``; the bus is joined by ``async with``. Functions that a method
+    Arguments are those of ``Client``; the bus is joined by ``async with``, and may be again after
+    it was left or could not be joined. Functions that a method
     takes (``on_step``, ``on_progress``, ``on_timings``) are called in the event loop.
     """
 
@@ -199,9 +201,7 @@ class AsyncClient:
         )
         self._client: Client | None = None
         self._streams: list[AsyncStream[Any]] = []
-        self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="palpate call")
-        # Of its own, for what waits for no answer: calls that do may have all of the others.
-        self._canceller = ThreadPoolExecutor(1, thread_name_prefix="palpate cancel")
+        self._start_threads()
 
     features = _awaitable(Client.features)
     electrodes = _awaitable(Client.electrodes)
@@ -280,11 +280,17 @@ class AsyncClient:
             await self.promptly(client.close)
         self._end_threads()
 
+    def _start_threads(self) -> None:
+        self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="palpate call")
+        # Of its own, for what waits for no answer: calls that do may have all of the others.
+        self._canceller = ThreadPoolExecutor(1, thread_name_prefix="palpate cancel")
+
     def _end_threads(self) -> None:
         for threads in (self._threads, self._canceller):
             threads.shutdown(wait=False)
 
     async def __aenter__(self) -> Self:
+        self._start_threads()  # it may have failed to join before, or have left
         opening = self._threads.submit(self._open)
         try:
             self._client = await asyncio.shield(asyncio.wrap_future(opening))

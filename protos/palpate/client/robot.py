@@ -44,7 +44,7 @@ from palpate.client.simulations import (
     ask_cancellation,
     ask_simulation,
 )
-from palpate.client.streams import SameSensor, Stream
+from palpate.client.streams import SameSensor, Stream, check_depth
 from palpate.config import (
     STATION_VARIABLE,
     TlsConfig,
@@ -371,8 +371,11 @@ class Client(Closing):
         A gateway with the driver ``pose_zenoh``, whose option ``robot`` has the same name, turns
         them into poses of the indenter.
         """
-        self._publishers.append(RobotPosePublisher(self.session, check_name(robot, "robot")))
-        return self._publishers[-1]
+        publisher = RobotPosePublisher(self.session, check_name(robot, "robot"))
+        with self._lock:
+            self._publishers = [one for one in self._publishers if not one.closed]
+            self._publishers.append(publisher)
+        return publisher
 
     def tare(
         self, sensor: str, *, frames: int = 0, timeout_s: float = 5.0, anyway: bool = False
@@ -492,8 +495,7 @@ class Client(Closing):
     def _stream(
         self, topic: Topic[M], sensor: str, max_age_s: float, timeout_s: float | None, depth: int
     ) -> Stream[M]:
-        if depth < 1:
-            raise ConfigError(f"depth = {depth} keeps nothing", remedy="give 1 or more")
+        check_depth(depth)
         subscriber = self.session.subscriber(
             topic, sensor=check_name(sensor, "sensor"), delivery=Delivery.NEWEST, depth=depth
         )

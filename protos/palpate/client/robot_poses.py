@@ -103,6 +103,12 @@ class RobotPosePublisher(Closing):
         """Publish what still waits, for a second at most, and stop."""
         self._closed.set()
         self._thread.join(_LAST_S)
+        self._publisher.close()
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed."""
+        return self._closed.is_set()
 
     def _run(self) -> None:
         while True:

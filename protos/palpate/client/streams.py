@@ -18,6 +18,7 @@ from palpate import clock
 from palpate.bus import ReceivedMessage, Subscriber
 from palpate.config import check_duration
 from palpate.errors import (
+    ConfigError,
     LinkError,
     PalpateError,
     SensorChanged,
@@ -41,6 +42,16 @@ _SAY_AGAIN_S = 10.0
 """How often a failing callback is logged [s]; each failure is counted."""
 
 _END_S = 5.0
+
+
+def check_depth(depth: int) -> None:
+    """Check how many messages of a stream are kept for a slow consumer.
+
+    Raises:
+        ConfigError: None.
+    """
+    if depth < 1:
+        raise ConfigError(f"depth = {depth} keeps nothing", remedy="give 1 or more")
 
 
 class SameSensor:

@@ -320,7 +320,11 @@ class _Stamps:
 
 
 def metadata_of(path: Path) -> dict[str, str]:
-    """Facts written at the start; empty where the file is too damaged to read them."""
+    """Facts written at the start; empty where the file is too damaged to read them.
+
+    Raises:
+        RecordingError: It cannot be read at present.
+    """
     try:
         with open_regular(path) as stream:
             for part in parts_of(stream):
@@ -328,7 +332,12 @@ def metadata_of(path: Path) -> dict[str, str]:
                     return dict(part.metadata)
                 if isinstance(part, McapMessage):
                     break
-    except (*DAMAGED, OSError):
+    except OSError as error:
+        raise RecordingError(
+            f"{path} cannot be read: {error.strerror or error}",
+            remedy="check its disk and its rights, and how many files may be open: ulimit -n",
+        ) from error
+    except DAMAGED:
         return {}
     return {}
 
