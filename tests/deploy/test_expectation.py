@@ -18,11 +18,13 @@ from palpate.errors import ConfigError, DeviceLost, LinkError
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState, Status, SupervisedProcess
 from palpate.process import state_folder
+from palpate_deploy.station import supervision
 from palpate_deploy.station.host import (
     KEPT_RUNS,
     RUN_LOCK,
     free_endpoint,
     new_run_folder,
+    private_profile,
     running_folders,
     write_profile,
     write_run_file,
@@ -121,6 +123,22 @@ def test_a_run_that_was_stopped_is_over_though_its_process_goes_on() -> None:
     assert run.folder.exists()
     assert run.folder not in running_folders()
     run.stop()
+
+
+@pytest.mark.parametrize("refused", ["write_profile", "write_run_file", "start_child"])
+def test_a_start_that_is_refused_leaves_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: str
+) -> None:
+    def full(*_: object) -> None:
+        raise ConfigError("no space left on device", remedy="free some")
+
+    monkeypatch.setattr(supervision, "_MEMORY", tmp_path)
+    monkeypatch.setattr(supervision, refused, full)
+    before = running_folders()
+    with pytest.raises(ConfigError, match="no space"):
+        supervision.Supervisor(private_profile("virtual"), "refused")
+    assert running_folders() == before
+    assert not [*tmp_path.glob("palpate-*")]
 
 
 def test_a_damaged_folder_is_passed_over() -> None:
