@@ -86,7 +86,8 @@ class Supervisor:
     """The processes of a profile, kept running until ``stop``; the run's folder bears the name.
 
     Raises:
-        ConfigError: The run's folder or a file in it cannot be written.
+        ConfigError: The run's folder cannot be made.
+        RunDiskError: Its disk is full.
         LinkError: The router's port is in use.
         SupervisorError: supervisord does not start.
     """
