@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
 import zlib
+from collections import deque
 from pathlib import Path
 
 from palpate.errors import ClockSkewError
@@ -41,14 +43,67 @@ def now() -> tuple[int, int]:
     return time.monotonic_ns(), time.time_ns()
 
 
+_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
+_SLEEP_NS = 1_000_000  # no host sleeps for less
+
+
+def since_boot_ns() -> int:
+    """Time since this host started [ns], with the time that it was asleep (suspended).
+
+    The monotonic clock stands still while the host is asleep. Outside Linux this is that clock.
+    """
+    return time.clock_gettime_ns(_BOOT)
+
+
+class HostSleep:
+    """Notices that this host was asleep, at the next call. Safe to use from several threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        # At most so long was it asleep since its start [ns].
+        self._most_ns = -time.monotonic_ns() + since_boot_ns()
+        # Of each sleep: a monotonic time soon after it, and how long it was [ns].
+        self._sleeps: deque[tuple[int, int]] = deque(maxlen=64)
+
+    def since_ns(self, monotonic_ns: int) -> int:
+        """How long the host was asleep after a monotonic time [ns].
+
+        When a sleep began is known to the call before it, so a time between the two calls may be
+        from before or after it: that counts as before, since nothing must look fresher than it is.
+        """
+        with self._lock:
+            before_ns = time.monotonic_ns()
+            boot_ns = since_boot_ns()
+            after_ns = time.monotonic_ns()
+            # A thread may be interrupted between two readings: only what is certain counts.
+            slept_ns = boot_ns - after_ns - self._most_ns
+            if slept_ns > _SLEEP_NS:
+                self._sleeps.append((after_ns, slept_ns))
+                self._most_ns = boot_ns - before_ns
+            else:
+                self._most_ns = min(self._most_ns, boot_ns - before_ns)
+            return sum(slept_ns for woke_ns, slept_ns in self._sleeps if monotonic_ns < woke_ns)
+
+
+_host_sleep = HostSleep()
+
+
+def elapsed_s(monotonic_ns: int) -> float:
+    """Time since a monotonic time of this host [ns], with the time that the host was asleep [s]."""
+    slept_ns = _host_sleep.since_ns(monotonic_ns)
+    return (time.monotonic_ns() - monotonic_ns + slept_ns) * 1e-9
+
+
 def age_s(stamp: Stamp, *, monotonic_ns: int | None = None, wall_ns: int | None = None) -> float:
     """Age of a reading [s]: by the monotonic clock on the same host and boot, else by wall clocks.
 
-    The times are this host's clocks [ns]; None = now.
+    The times are this host's clocks [ns]; None = now, and then the time that this host was asleep
+    counts.
     """
     if stamp.clock_id == CLOCK_ID:
-        now_ns = time.monotonic_ns() if monotonic_ns is None else monotonic_ns
-        return (now_ns - stamp.monotonic_ns) * 1e-9
+        if monotonic_ns is None:
+            return elapsed_s(stamp.monotonic_ns)
+        return (monotonic_ns - stamp.monotonic_ns) * 1e-9
     now_ns = time.time_ns() if wall_ns is None else wall_ns
     return (now_ns - stamp.wall_ns) * 1e-9
 

@@ -195,8 +195,13 @@ class Health:
                 self._message = self._state_message
 
     def set_state(self, state: ServiceState, message: str = "") -> None:
-        """Set the state of this process; from DEGRADED it is READY after ``RECOVERY_S`` only."""
+        """Set the state of this process; from DEGRADED it is READY after ``RECOVERY_S`` only.
+
+        One that is STOPPING is not READY again, whatever a thread that does not know of it says.
+        """
         with self._lock:
+            if state is ServiceState.READY and self._state is ServiceState.STOPPING:
+                return
             if state is ServiceState.READY and self._state is ServiceState.DEGRADED:
                 since_s = time.monotonic() if self._recovery is None else self._recovery[0]
                 self._recovery = since_s, message

@@ -29,7 +29,7 @@ from palpate.config import LinkConfig
 from palpate.errors import BundleError, ConfigError, LinkError, RecordingError, StreamTimeout
 from palpate.files.bundle import read_bundle, write_bundle
 from palpate.health import Health
-from palpate.messages import NO_TARE, QualityFlag
+from palpate.messages import NO_TARE, QualityFlag, ServiceState
 from palpate_deploy.station import calibrate, guided_presses
 from palpate_deploy.station.guided_presses import HELD_S, PressCounter
 from palpate_services.config import ModelsConfig, RecorderConfig
@@ -218,6 +218,19 @@ def test_the_record_is_that_of_its_own_recorder(
     assert recording.path() == tmp_path / "lab-1.mcap"
     assert recording.path().read_text() == "own"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lab-1.mcap", "lab-2.mcap"]
+
+
+def test_nothing_is_pressed_before_the_recorder_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(*args: Any, health: Health, **_: object) -> None:
+        time.sleep(0.2)
+        health.set_state(ServiceState.READY, "recording")
+        args[-1].wait(60)
+
+    monkeypatch.setattr(guided_presses, "run_recorder", run)
+    with guided_presses._recording(LinkConfig(), "lab", "finger", tmp_path) as recording:
+        assert recording.health.state is ServiceState.READY
 
 
 def recording_of(

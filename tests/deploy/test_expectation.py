@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import subprocess
@@ -14,19 +15,23 @@ from palpate.bus import Session
 from palpate.bus.no_router import RouterAbsent
 from palpate.census import SUPERVISOR, ProcessReport
 from palpate.config import LinkConfig, endpoint_host_port
-from palpate.errors import ConfigError, DeviceLost, LinkError
+from palpate.errors import ConfigError, DeviceLost, LinkError, PalpateError
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState, Status, SupervisedProcess
 from palpate.process import state_folder
+from palpate_deploy.station import supervision
 from palpate_deploy.station.host import (
     KEPT_RUNS,
     RUN_LOCK,
+    RunDiskError,
     free_endpoint,
     new_run_folder,
+    private_profile,
     running_folders,
     write_profile,
     write_run_file,
 )
+from palpate_deploy.station.logs import FAILED, exit_code
 from palpate_deploy.station.processes import FiniteRun
 from palpate_deploy.station.profile import parse_profile
 from palpate_deploy.station.status import show_status
@@ -121,6 +126,22 @@ def test_a_run_that_was_stopped_is_over_though_its_process_goes_on() -> None:
     assert run.folder.exists()
     assert run.folder not in running_folders()
     run.stop()
+
+
+@pytest.mark.parametrize("refused", ["write_profile", "write_run_file", "start_child"])
+def test_a_start_that_is_refused_leaves_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: str
+) -> None:
+    def full(*_: object) -> None:
+        raise ConfigError("no space left on device", remedy="free some")
+
+    monkeypatch.setattr(supervision, "_MEMORY", tmp_path)
+    monkeypatch.setattr(supervision, refused, full)
+    before = running_folders()
+    with pytest.raises(ConfigError, match="no space"):
+        supervision.Supervisor(private_profile("virtual"), "refused")
+    assert running_folders() == before
+    assert not [*tmp_path.glob("palpate-*")]
 
 
 def test_a_damaged_folder_is_passed_over() -> None:
@@ -230,8 +251,24 @@ def test_a_process_that_is_started_again_or_is_elsewhere_is_not_for_a_health_che
 
 
 def test_a_full_disk_of_state_is_told_with_a_remedy() -> None:
-    with pytest.raises(ConfigError, match=r"No space left.*XDG_STATE_HOME"):
+    """And not as a mistake in the profile, after which systemd does not try again."""
+    with pytest.raises(RunDiskError, match=r"No space left.*XDG_STATE_HOME") as caught:
         write_run_file(Path("/dev/full"), "a profile")
+    assert exit_code(caught.value) == FAILED
+
+
+@pytest.mark.parametrize(
+    ("number", "refusal"), [(errno.ENOSPC, RunDiskError), (errno.EACCES, ConfigError)]
+)
+def test_a_full_disk_is_no_forbidden_folder(
+    monkeypatch: pytest.MonkeyPatch, number: int, refusal: type[PalpateError]
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(refusal, match="XDG_STATE_HOME"):
+        new_run_folder("lab")
 
 
 def test_a_run_of_an_older_palpate_is_told_by_its_process() -> None:

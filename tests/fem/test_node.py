@@ -8,6 +8,7 @@ import importlib
 import threading
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,13 @@ import pytest
 import zenoh
 
 from palpate.bus import MAX_PAYLOAD_BYTES, Delivery
-from palpate.bus.topics import ENCODING_PREFIX, SIMULATION_PROGRESS, sensor_key
+from palpate.bus.topics import ENCODING_PREFIX, SIMULATION_PROGRESS, caller_key, sensor_key
 from palpate.client import Client
 from palpate.client.simulations import straight_path
 from palpate.codec import ERROR, SIMULATION_REQUEST
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import ConfigError, ErrorCode, RemoteError, StreamTimeout
+from palpate.health import Health
 from palpate.messages import (
     SimulationOutcome,
     SimulationParameters,
@@ -331,6 +333,27 @@ def test_nobody_waits_for_it_any_more(service: Any) -> None:
     service.until(lambda: service.counters().get("callers_gone", 0) == before + 1)
     leaving.close()
     service.until(lambda: service.robot.status()[0].gauges["busy_workers"] == 0)
+
+
+@pytest.mark.parametrize("told_first", [False, True])
+@pytest.mark.parametrize(("arrived_s", "stopped"), [(1, ["left early"]), (3, [])])
+def test_a_caller_may_leave_while_its_question_waits_to_be_taken(
+    monkeypatch: pytest.MonkeyPatch, told_first: bool, arrived_s: int, stopped: list[str]
+) -> None:
+    """What arrived after it left belongs to its next call."""
+    cancelled: list[str] = []
+    pool = SimpleNamespace(submit=lambda *_: None, cancel=cancelled.append)
+    monkeypatch.setattr(node, "_pool_of", lambda *_: pool)
+    session: Any = SimpleNamespace(station="lab", publisher=lambda *_, **__: None)
+    health = Health("fem", "fem")
+    taking = node.SimulationService(session, FemConfig(), FingertipParameters(), health, None)
+    answer: Any = SimpleNamespace(arrived_ns=arrived_s * 10**9)
+    for told in (told_first, not told_first):
+        if told:
+            taking.caller_gone(caller_key("lab", "left early"), 2.0)
+        else:
+            taking.simulate(fakes.request("left early"), answer)
+    assert cancelled == stopped
 
 
 def test_a_caller_may_ask_again_at_once_with_the_same_id(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -17,7 +19,7 @@ from palpate.bus.topics import ELECTRODES
 from palpate.client.estimates import ask_tare
 from palpate.errors import ErrorCode, RemoteError
 from palpate.messages import ServiceState, TareRequest
-from palpate_gateway.service.requests import MOST
+from palpate_gateway.service.requests import MOST, SensorRequests
 from palpate_gateway.virtual.faults import FaultPlan
 
 PATIENCE_S = 20.0
@@ -126,6 +128,28 @@ def test_a_caller_without_a_token_is_worked_for_until_its_deadline(
         bus.until(lambda: threads_named("tare of finger") == 0)
         seen = bus.status().counters["frames_published"]
         assert seen < 2000
+
+
+@pytest.mark.parametrize("told_first", [False, True])
+@pytest.mark.parametrize(("arrived_s", "dropped"), [(1, True), (3, False)])
+def test_who_leaves_while_its_question_waits_to_be_taken_is_not_worked_for(
+    told_first: bool, arrived_s: int, dropped: bool
+) -> None:
+    """What arrived after it left belongs to its next call."""
+    requests: SensorRequests[Any] = SensorRequests(
+        "finger", what="tare", readings="frames", rate_hz=RATE_HZ
+    )
+    wanted: Future[Any] = Future()
+    answer: Any = Mock(arrived_ns=arrived_s * 10**9, deadline_s=math.inf)
+    for told in (told_first, not told_first):
+        if told:
+            requests.caller_gone("a caller", 2.0)
+        else:
+            requests.serve(
+                answer, lambda: wanted, caller="a caller", readings=1, in_turn=False, slack_s=20.0
+            )
+    assert wanted.cancelled() is dropped
+    wanted.cancel()
 
 
 def test_callers_of_others_end_nothing(bus: Any, finger: dict[str, Any]) -> None:

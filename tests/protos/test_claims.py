@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from palpate import clock
 from palpate.bus import SensorClaims, Session, run_router
 from palpate.bus.claims import YIELD_S
 from palpate.bus.topics import CLAIM_ROOT, SensorClaim, claim_key
@@ -206,6 +207,20 @@ def test_a_stall_of_this_process_alone_costs_no_claim(
         with claims._changed:
             claims._alive_s -= 2 * LEASE_S
         claims.check("finger")  # looks again, and holds again
+
+
+def test_a_claim_is_given_up_and_begun_again_after_the_host_slept(
+    link: LinkConfig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Others have seen its lease end meanwhile."""
+    true_ns, slept_ns = clock.since_boot_ns, 0
+    monkeypatch.setattr(clock, "since_boot_ns", lambda: true_ns() + slept_ns)
+    with claims_of(link, 1) as claims:
+        assert held_within_patience(claims)
+        assert "stood still" not in caplog.text
+        slept_ns = round(2e9 * LEASE_S)
+        claims.check("finger")  # looks again, and holds again
+        assert "stood still" in caplog.text
 
 
 @pytest.mark.parametrize("older", [True, False])

@@ -1,4 +1,4 @@
-"""A stamp in the future is no fresh one, from this host or from another."""
+"""A stamp in the future is no fresh one, from this host or from another, nor is one slept on."""
 
 from __future__ import annotations
 
@@ -66,6 +66,50 @@ def test_what_lies_in_the_past_has_its_age(age_s: float, clock_id: int) -> None:
     found_s = clock.checked_age_s(stamp)
     took_s = time.monotonic() - began_s
     assert age_s - 1e-3 <= found_s <= age_s + took_s + 1e-3
+
+
+@pytest.fixture
+def asleep(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Lets the host seem to have been asleep for some seconds more."""
+    true_ns, slept_ns = clock.since_boot_ns, 0
+    monkeypatch.setattr(clock, "since_boot_ns", lambda: true_ns() + slept_ns)
+    monkeypatch.setattr(clock, "_host_sleep", clock.HostSleep())
+
+    def sleep(seconds: float) -> None:
+        nonlocal slept_ns
+        slept_ns += round(seconds * SECOND_NS)
+
+    return sleep
+
+
+def test_an_age_includes_the_time_that_the_host_was_asleep(
+    asleep: Callable[[float], None],
+) -> None:
+    before = Stamp(1, 1, origin=Origin.LIVE, **stamped(0.0, clock.CLOCK_ID))
+    assert clock.checked_age_s(before) < 60.0
+    asleep(3600.0)
+    assert 3600.0 <= clock.checked_age_s(before) < 3660.0
+    after = Stamp(2, 2, origin=Origin.LIVE, **stamped(0.0, clock.CLOCK_ID))
+    assert clock.checked_age_s(after) < 60.0
+    asleep(7200.0)
+    assert 7200.0 <= clock.checked_age_s(after) < 7260.0
+    assert 10800.0 <= clock.checked_age_s(before) < 10860.0
+
+
+def test_what_came_before_the_host_slept_is_not_the_latest(
+    link: LinkConfig, frame_of: FrameOf, wait_until: WaitUntil, asleep: Callable[[float], None]
+) -> None:
+    with Session.open(link) as session:
+        subscriber = session.subscriber(ELECTRODES)
+        publisher = session.publisher(ELECTRODES, sensor="finger")
+        publisher.put(frame_of(1, **stamped(0.0, clock.CLOCK_ID)))
+        wait_until(lambda: subscriber.counters.get("received"))
+        asleep(3600.0)
+        with pytest.raises(StaleError, match=r"36\d\d\.\d+ s old"):
+            subscriber.latest(max_age_s=600.0)
+        publisher.put(frame_of(2, **stamped(0.0, clock.CLOCK_ID)))
+        wait_until(lambda: subscriber.counters.get("received") == 2)
+        assert subscriber.latest(max_age_s=600.0).message.stamp.sequence == 2
 
 
 @pytest.mark.parametrize("clock_id", [clock.CLOCK_ID, OTHER_HOST], ids=["same", "other"])

@@ -105,6 +105,14 @@ def test_stopping_waits_for_nothing(clock: Time) -> None:
     assert health.state is ServiceState.STOPPING
 
 
+def test_what_stops_is_not_ready_again() -> None:
+    """A command that ends meanwhile says what serves."""
+    health = Health("features", "features")
+    health.set_state(ServiceState.STOPPING, "draining")
+    health.set_state(ServiceState.READY, "serves force 3")
+    assert (health.state, health.status().message) == (ServiceState.STOPPING, "draining")
+
+
 def test_a_lost_sensor_is_live_when_it_has_delivered_for_a_while(clock: Time) -> None:
     health = Health("gateway", "gateway")
 

@@ -261,7 +261,7 @@ class _Recording:
 
 @contextlib.contextmanager
 def _recording(link: LinkConfig, station: str, sensor: str, out: Path) -> Iterator[_Recording]:
-    """Record the finger inside the block."""
+    """Record the finger inside the block, which begins when the recorder records or has failed."""
     recording, stop = _Recording(out), threading.Event()
     settings = {
         **EVERYTHING,
@@ -282,6 +282,9 @@ def _recording(link: LinkConfig, station: str, sensor: str, out: Path) -> Iterat
     thread = threading.Thread(target=run, name="record", daemon=True)
     thread.start()
     try:
+        # What is pressed before would be counted, and missing in the record.
+        while thread.is_alive() and recording.health.state is ServiceState.STARTING:
+            time.sleep(0.02)
         yield recording
     finally:
         stop.set()

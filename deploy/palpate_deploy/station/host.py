@@ -16,9 +16,15 @@ import tomli_w
 
 from palpate.bus import Session
 from palpate.config import Role, endpoint_host_port
-from palpate.errors import ConfigError, LinkError, RecordingError
+from palpate.errors import ConfigError, ErrorCode, LinkError, PalpateError, RecordingError
 from palpate.process import state_folder
 from palpate_deploy.station.profile import Profile, changed, load_profile, plain_values
+
+
+class RunDiskError(PalpateError, OSError):
+    """A disk has no room for the files of a run; where one is made, the run can be started."""
+
+    code = ErrorCode.DISK
 
 
 def check_free(endpoints: Iterable[str]) -> None:
@@ -128,6 +134,7 @@ def new_run_folder(name: str) -> Path:
 
     Raises:
         ConfigError: The folder cannot be made.
+        RunDiskError: The disk is full.
     """
     runs = state_folder() / "runs"
     stamp = time.strftime("%Y%m%d-%H%M%S")
@@ -139,6 +146,8 @@ def new_run_folder(name: str) -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)
         _locks[folder] = lock
     except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise _no_room(folder, error) from error
         raise ConfigError(
             f"run folder {folder} cannot be made: {error.strerror or error}",
             remedy="set XDG_STATE_HOME to a folder you may write in",
@@ -197,7 +206,7 @@ def write_profile(profile: Profile, folder: Path) -> Path:
     """Write the resolved profile that all processes of a run read.
 
     Raises:
-        ConfigError: The disk refuses.
+        RunDiskError: The disk refuses.
     """
     return write_run_file(folder / "profile.toml", tomli_w.dumps(plain_values(profile)))
 
@@ -206,13 +215,17 @@ def write_run_file(path: Path, text: str) -> Path:
     """Write a file into the folder of a run; the path again.
 
     Raises:
-        ConfigError: The disk refuses.
+        RunDiskError: The disk refuses.
     """
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ConfigError(
-            f"{path} cannot be written: {error.strerror or error}",
-            remedy="free some space there, or set XDG_STATE_HOME to a folder of another disk",
-        ) from error
+        raise _no_room(path, error) from error
     return path
+
+
+def _no_room(path: Path, error: OSError) -> RunDiskError:
+    return RunDiskError(
+        f"{path} cannot be written: {error.strerror or error}",
+        remedy="free some space there, or set XDG_STATE_HOME to a folder of another disk",
+    )

@@ -86,7 +86,8 @@ class Supervisor:
     """The processes of a profile, kept running until ``stop``; the run's folder bears the name.
 
     Raises:
-        ConfigError: The run's folder or a file in it cannot be written.
+        ConfigError: The run's folder cannot be made.
+        RunDiskError: Its disk is full.
         LinkError: The router's port is in use.
         SupervisorError: supervisord does not start.
     """
@@ -95,28 +96,29 @@ class Supervisor:
         if "router" in profile.processes:
             check_free(profile.router.listen)
         self.profile = profile
-        self.folder = new_run_folder(name)
         self._mute = False
-        # The path of a Unix socket is limited to 107 bytes: a folder there is short enough. In
-        # memory, because a heartbeat must never wait for a disk.
-        in_memory = _MEMORY if os.access(_MEMORY, os.W_OK) else None
-        self._socket_folder = Path(tempfile.mkdtemp(prefix="palpate-", dir=in_memory))
-        self._socket = self._socket_folder / "supervisor.sock"
-        text = self._config_text(write_profile(profile, self.folder))
-        config = write_run_file(self.folder / "supervisord.conf", text)
-        command = [sys.executable, "-m", "palpate_deploy.station.supervisord"]
-        command += ["-n", "-s", "-c", str(config)]
-        self._process = start_child(
-            command, self.logs / "supervisord.out", {WATCH_FOLDER: str(self._socket_folder)}
-        )
-        self._rpc = xmlrpc.client.ServerProxy(
-            "http://127.0.0.1", transport=_transport(self._socket)
-        )
-        try:
+        with contextlib.ExitStack() as undo:
+            self.folder = new_run_folder(name)
+            undo.callback(end_run, self.folder)
+            # The path of a Unix socket is limited to 107 bytes: a folder there is short enough. In
+            # memory, because a heartbeat must never wait for a disk.
+            in_memory = _MEMORY if os.access(_MEMORY, os.W_OK) else None
+            self._socket_folder = Path(tempfile.mkdtemp(prefix="palpate-", dir=in_memory))
+            undo.callback(shutil.rmtree, self._socket_folder, ignore_errors=True)
+            self._socket = self._socket_folder / "supervisor.sock"
+            text = self._config_text(write_profile(profile, self.folder))
+            config = write_run_file(self.folder / "supervisord.conf", text)
+            command = [sys.executable, "-m", "palpate_deploy.station.supervisord"]
+            command += ["-n", "-s", "-c", str(config)]
+            self._process = start_child(
+                command, self.logs / "supervisord.out", {WATCH_FOLDER: str(self._socket_folder)}
+            )
+            undo.callback(self.stop)
+            self._rpc = xmlrpc.client.ServerProxy(
+                "http://127.0.0.1", transport=_transport(self._socket)
+            )
             self._wait_for_rpc()
-        except BaseException:
-            self.stop()
-            raise
+            undo.pop_all()
 
     @property
     def logs(self) -> Path:

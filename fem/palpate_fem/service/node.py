@@ -71,6 +71,7 @@ _CLAIM_S = 1.0
 """A key that is free is claimed within this time [s]."""
 
 _FINGERTIPS_KNOWN = 16
+_GONE_KNOWN = 1024
 _REFUSED = (ErrorCode.INVALID_REQUEST, ErrorCode.RESOURCE_EXHAUSTED, ErrorCode.UNAVAILABLE)
 
 
@@ -211,6 +212,7 @@ class SimulationService(Closing):
         self._health = health
         self._lock = threading.Lock()
         self._active: dict[str, ActiveSimulation] = {}
+        self._gone_s: OrderedDict[str, float] = OrderedDict()
         self._fingertips: OrderedDict[FingertipParameters, StoredFingertip] = OrderedDict()
         self._progress = session.publisher(SIMULATION_PROGRESS, sensor=config.sensor)
         self.pool = _pool_of(config, default, device, self._remember)
@@ -241,6 +243,9 @@ class SimulationService(Closing):
             except PalpateError:
                 self._forget(active)
                 raise
+            key = caller_key(self._station, request.request_id)
+            if (gone_s := self._gone_s.get(key)) is not None:  # while the question waited
+                self.caller_gone(key, gone_s)
         except PalpateError as error:
             if error.code in _REFUSED:
                 self._health.count(f"requests_refused_{error.code.name.lower()}")
@@ -255,14 +260,18 @@ class SimulationService(Closing):
 
         Args:
             key: The ``caller_key`` that vanished.
-            when_s: When it vanished [s, monotonic]; a later request with the same id is another
-                call.
+            when_s: When it vanished [s, monotonic]; a request with the same id that arrives later
+                is another call.
         """
         with self._lock:
+            self._gone_s[key] = when_s
+            if len(self._gone_s) > _GONE_KNOWN:
+                self._gone_s.popitem(last=False)
             ids = [
                 name
                 for name, active in self._active.items()
-                if active.since_s <= when_s and caller_key(self._station, name) == key
+                if active.answer.arrived_ns * 1e-9 <= when_s
+                and caller_key(self._station, name) == key
             ]
         for name in ids:
             if self.pool.cancel(name):

@@ -1,5 +1,7 @@
 """The host's wall clock: its steps, its relation to the monotonic clock, and its error.
 
+The monotonic clock stands still while the host is asleep (suspended), the wall clock does not.
+
 ``WallClock`` gives each stamp its wall time and notices when the clock is set. ``KernelStamps``
 converts the kernel's receive stamps, which are wall times, to monotonic times. ``wall_discipline``
 asks the kernel how well the clock is kept.
@@ -20,6 +22,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from palpate.clock import since_boot_ns
+
 _log = logging.getLogger(__name__)
 
 LOOK_NS = 100_000_000
@@ -37,22 +41,28 @@ _STEERED = 1e-3
 
 
 class ClockPair(NamedTuple):
-    """Monotonic and wall clock read together [ns], and the time between both readings [ns]."""
+    """Monotonic and wall clock read together [ns], and the time between the first and last reading.
+
+    ``asleep_ns`` is how long the host was asleep since its start [ns].
+    """
 
     monotonic_ns: int
     wall_ns: int
     apart_ns: int
+    asleep_ns: int = 0
 
 
 def read_pair() -> ClockPair:
-    """Both clocks of this host; read again if this thread was interrupted between them."""
+    """The clocks of this host; read again if this thread was interrupted between them."""
     best: ClockPair | None = None
     for _ in range(_ATTEMPTS):
         before_ns = time.monotonic_ns()
         wall_ns = time.time_ns()
+        boot_ns = since_boot_ns()
         apart_ns = time.monotonic_ns() - before_ns
         if best is None or apart_ns < best.apart_ns:
-            best = ClockPair(before_ns + apart_ns // 2, wall_ns, apart_ns)
+            middle_ns = before_ns + apart_ns // 2
+            best = ClockPair(middle_ns, wall_ns, apart_ns, boot_ns - middle_ns)
         if apart_ns <= _TIGHT_NS:
             break
     assert best is not None
@@ -63,7 +73,9 @@ class WallClock:
     """Turns monotonic times into wall times; one for all sensors of a process, from any thread.
 
     Linux slews both clocks alike, so the difference between them changes only when the wall clock
-    is set: a step. Wall times follow it within ``LOOK_NS``; monotonic times do not change.
+    is set: a step. Wall times follow it within ``LOOK_NS``; monotonic times do not change. The
+    difference grows also by the time that the host is asleep, which is no step: times before the
+    look that notices it keep their wall times.
     """
 
     def __init__(self, read: Callable[[], ClockPair] = read_pair) -> None:
@@ -74,32 +86,41 @@ class WallClock:
         pair = read()
         self.offset_ns = pair.wall_ns - pair.monotonic_ns
         """Wall clock minus monotonic clock at the last look [ns]."""
-        self._apart_ns = pair.apart_ns
+        self._apart_ns, self._asleep_ns = pair.apart_ns, pair.asleep_ns
         self.looked_ns = pair.monotonic_ns
         """Monotonic time of the last look [ns]."""
+        self.before_sleep = -1, self.offset_ns
+        """Monotonic time at which a sleep was noticed, and the offset until then [ns]."""
 
     def at(self, monotonic_ns: int, *, now_ns: int) -> int:
         """Wall time of a monotonic time [ns]; looks again if the last look is old at ``now_ns``."""
         if now_ns - self.looked_ns > LOOK_NS:
             self.look()
-        return monotonic_ns + self.offset_ns
+        until_ns, offset_ns = self.before_sleep
+        return monotonic_ns + (offset_ns if monotonic_ns <= until_ns else self.offset_ns)
 
     def look(self) -> None:
-        """Read both clocks now."""
+        """Read the clocks now."""
         with self._lock:
             pair = self._read()
             offset_ns = pair.wall_ns - pair.monotonic_ns
-            change_ns = offset_ns - self.offset_ns
-            # Either reading of both clocks may be off by the time between its two parts.
+            slept_ns = pair.asleep_ns - self._asleep_ns
+            change_ns = offset_ns - self.offset_ns - slept_ns
+            # Either reading of the clocks may be off by the time between its parts.
             unsure_ns = pair.apart_ns + self._apart_ns
             parted_ns = _STEERED * (pair.monotonic_ns - self.looked_ns)
             self.looked_ns = pair.monotonic_ns
             if abs(change_ns) > unsure_ns + _STEP_NS + parted_ns:
                 self.steps += 1
                 _log.warning("the wall clock was set by %+.6f s", 1e-9 * change_ns)
-            elif abs(change_ns) <= unsure_ns and pair.apart_ns >= self._apart_ns:
+                self.before_sleep = -1, offset_ns
+            elif max(abs(change_ns), slept_ns) <= unsure_ns and pair.apart_ns >= self._apart_ns:
                 return  # no change, and the earlier reading was more exact
+            if slept_ns > unsure_ns + _STEP_NS:
+                _log.warning("this host was asleep for %.3f s", 1e-9 * slept_ns)
+                self.before_sleep = pair.monotonic_ns, self.offset_ns
             self.offset_ns, self._apart_ns = offset_ns, pair.apart_ns
+            self._asleep_ns = pair.asleep_ns
 
 
 OLDEST_NS = 1_000_000_000
@@ -118,7 +139,8 @@ class KernelStamps:
     An implausible stamp is replaced by the time of arrival: a missing one, one in the future or
     more than a second old (of another clock, or another host), and any within a second of a step of
     the wall clock, since it may be from before or after the step. After a pause of this process,
-    stamps may be older by the length of the pause.
+    stamps may be older by the length of the pause. What came before the host was asleep keeps the
+    monotonic time at which it came.
     """
 
     def __init__(self, wall: WallClock | None = None) -> None:
@@ -143,7 +165,10 @@ class KernelStamps:
         """As ``monotonic_ns``, for a stamp in [ns since the Unix epoch]."""
         if not self._trusted(arrival_ns):
             return arrival_ns
-        received_ns = stamp_ns - self._wall.offset_ns
+        until_ns, offset_ns = self._wall.before_sleep
+        if stamp_ns - offset_ns > until_ns:
+            offset_ns = self._wall.offset_ns
+        received_ns = stamp_ns - offset_ns
         if not -_EARLY_NS <= arrival_ns - received_ns <= self._oldest_ns(arrival_ns):
             return arrival_ns
         return min(received_ns, arrival_ns)
@@ -158,7 +183,11 @@ class KernelStamps:
         """
         if not self._trusted(arrival_ns):
             return np.full(len(stamps_ns), arrival_ns)
-        received_ns = stamps_ns - self._wall.offset_ns
+        until_ns, offset_ns = self._wall.before_sleep
+        received_ns = stamps_ns - offset_ns
+        received_ns = np.where(
+            received_ns > until_ns, stamps_ns - self._wall.offset_ns, received_ns
+        )
         waited_ns = arrival_ns - received_ns
         plausible = (waited_ns >= -_EARLY_NS) & (waited_ns <= self._oldest_ns(arrival_ns))
         came_ns = np.where(plausible, np.minimum(received_ns, arrival_ns), arrival_ns)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
@@ -24,13 +25,14 @@ MOST = 8
 """So many requests may wait for the readings of one sensor."""
 
 _RETRY_LEAST_S = 0.1
+_GONE_KNOWN = 1024
 
 R = TypeVar("R")
 
 
 @dataclass(frozen=True, slots=True)
 class _Waiting(Generic[R]):
-    """One request: who asks, since when, what it will get, and when that is expected."""
+    """One request: who asks, when it arrived, what it will get, and when that is expected."""
 
     caller: str
     since_s: float
@@ -53,6 +55,7 @@ class SensorRequests(Generic[R]):
         self._rate_hz = rate_hz
         self._lock = threading.Lock()
         self._waiting: list[_Waiting[R]] = []
+        self._gone_s: OrderedDict[str, float] = OrderedDict()
 
     def check_count(self, count: int, *, least: int, usual: int) -> int:
         """The number of readings that a request wants; 0 means ``usual``, which is always allowed.
@@ -109,8 +112,10 @@ class SensorRequests(Generic[R]):
                 )
             before = [one.expected_s for one in self._waiting] if in_turn else []
             expected_s = max([now_s, *before]) + readings / self._rate_hz
-            one = _Waiting(caller, now_s, expected_s, begin())
+            one = _Waiting(caller, answer.arrived_ns * 1e-9, expected_s, begin())
             self._waiting.append(one)
+        if (gone_s := self._gone_s.get(caller)) is not None:  # while the question waited
+            self.caller_gone(caller, gone_s)
         # A thread for each: a caller whose link is stuck holds up no other, least of all the
         # thread that reads the sensor.
         threading.Thread(
@@ -123,6 +128,9 @@ class SensorRequests(Generic[R]):
     def caller_gone(self, caller: str, when_s: float) -> None:
         """Drop the requests of a caller whose token vanished at ``when_s`` [s, monotonic]."""
         with self._lock:
+            self._gone_s[caller] = when_s
+            if len(self._gone_s) > _GONE_KNOWN:
+                self._gone_s.popitem(last=False)
             gone = [one for one in self._waiting if one.caller == caller and one.since_s <= when_s]
         for one in gone:
             one.future.cancel()

@@ -5,8 +5,8 @@ holds the sensor, and none with a lower session id wants it, for ``SETTLE_S``, t
 ``held`` and the gateway may publish. A token vanishes with its process, or with the lease of a link
 whose process stands still, and one that waits takes over.
 
-A process that itself stood still for longer than the lease may have lost a claim without seeing it:
-it gives the claim up and begins again.
+A process that itself stood still for longer than the lease, or whose host was asleep for so long,
+may have lost a claim without seeing it: it gives the claim up and begins again.
 
 What services do is claimed in the same way. Of those that publish estimates of a sensor one holds
 the claim and the others stand by. Of those that answer one key any number may hold it together, if
@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 
 import zenoh
 
+from palpate import clock
 from palpate.bus.topics import (
     CLAIM_ROOT,
     STATION_ROOT,
@@ -105,7 +106,7 @@ class SensorClaims(Declared):
         self._others: dict[str, SensorClaim] = {}
         self._ignored = False
         self._changed = threading.Condition(threading.RLock())
-        self._alive_s = time.monotonic()
+        self._alive_s = _alive_s()
         self._was_joined, self._blind_until_s = False, 0.0
         self._subscriber = self._liveliness.declare_subscriber(
             claims_key(station, root=root), self._on_sample, history=True
@@ -141,7 +142,7 @@ class SensorClaims(Declared):
     def holds(self, sensor: str) -> bool:
         """Whether a wanted sensor is held now; does not wait. Call it before each message."""
         own = self._own[sensor]
-        now_s = time.monotonic()
+        now_s = _alive_s()
         if own.claim.held and now_s - self._alive_s >= self.lease_s:
             with self._changed:  # this process stood still, and may have lost it
                 self._look()
@@ -191,7 +192,7 @@ class SensorClaims(Declared):
             ClaimedElsewhere: It does not; a ``SensorTaken`` where sensors are claimed.
         """
         own = self._own[sensor]
-        now_s = time.monotonic()
+        now_s = _alive_s()
         if own.claim.held and now_s - self._alive_s < self.lease_s:
             self._alive_s = now_s
             return
@@ -277,9 +278,9 @@ class SensorClaims(Declared):
 
     def _look(self) -> None:
         """Bring every claim up to date; with the lock."""
-        now_s = time.monotonic()
-        stood_still = now_s - self._alive_s >= self.lease_s
-        self._alive_s = now_s
+        now_s, alive_s = time.monotonic(), _alive_s()
+        stood_still = alive_s - self._alive_s >= self.lease_s
+        self._alive_s = alive_s
         sees = all(own.claim.held for own in self._own.values()) or self._sees(now_s)
         for own in self._own.values():
             if stood_still and own.claim.held:
@@ -328,6 +329,11 @@ class SensorClaims(Declared):
         own.claim = claim
         for token in before.values():
             token.undeclare()
+
+
+def _alive_s() -> float:
+    """A clock that goes on while the host is asleep: others then see this process as gone [s]."""
+    return clock.since_boot_ns() * 1e-9
 
 
 def _taken(rival: SensorClaim) -> ClaimedElsewhere:

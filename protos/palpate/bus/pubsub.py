@@ -464,7 +464,7 @@ class Subscriber(Generic[M], Declared):
         Raises:
             ClockSkewError: It was stamped in the future.
         """
-        seen_s = (time.monotonic_ns() - received.received_monotonic_ns) * 1e-9
+        seen_s = clock.elapsed_s(received.received_monotonic_ns)
         if received.stamp is None:
             return seen_s
         stamp = received.stamp

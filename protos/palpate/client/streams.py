@@ -163,7 +163,7 @@ class Stream(Closing, Generic[M]):
 
     def _check_age(self, received: ReceivedMessage[M]) -> None:
         stamp = self._subscriber.topic.stamp_of(received.message)
-        age_s = (time.monotonic_ns() - received.received_monotonic_ns) * 1e-9
+        age_s = clock.elapsed_s(received.received_monotonic_ns)
         if stamp is not None:
             stamped_s = clock.checked_age_s(stamp, wall_clock_error_s=self._wall_clock_error_s)
             age_s = max(age_s, stamped_s)

@@ -6,8 +6,10 @@ import gc
 import sys
 import time
 
+import numpy as np
 import pytest
 
+from palpate.clock import since_boot_ns
 from palpate_gateway.clock.wall_clock import (
     LOOK_NS,
     OLDEST_NS,
@@ -30,11 +32,18 @@ class Clocks:
         self.now_ns = 5 * S
         self.offset_ns = EPOCH_NS
         self.apart_ns = 1000
+        self.asleep_ns = 0
         self.looks = 0
 
     def read(self) -> ClockPair:
         self.looks += 1
-        return ClockPair(self.now_ns, self.now_ns + self.offset_ns, self.apart_ns)
+        wall_ns = self.now_ns + self.offset_ns
+        return ClockPair(self.now_ns, wall_ns, self.apart_ns, self.asleep_ns)
+
+    def sleep(self, slept_ns: int) -> None:
+        """The monotonic clock stands still, the others go on."""
+        self.offset_ns += slept_ns
+        self.asleep_ns += slept_ns
 
 
 @pytest.fixture
@@ -57,6 +66,7 @@ def test_the_two_clocks_are_read_together() -> None:
     pair = read_pair()
     assert before_ns <= pair.monotonic_ns <= time.monotonic_ns()
     assert abs(pair.wall_ns - time.time_ns()) < 10 * S
+    assert abs(pair.monotonic_ns + pair.asleep_ns - since_boot_ns()) < 10 * S
     assert pair.apart_ns >= 0
 
 
@@ -96,6 +106,40 @@ def test_a_monotonic_clock_that_is_not_steered_drifts_without_steps(
         wall.look()
     assert wall.steps == 0
     assert abs(wall.offset_ns - clocks.offset_ns) <= 2 * clocks.apart_ns
+
+
+def test_that_the_host_was_asleep_is_no_step(
+    wall: WallClock, clocks: Clocks, caplog: pytest.LogCaptureFixture
+) -> None:
+    slept_ns = 3600 * S
+    clocks.sleep(slept_ns)
+    clocks.now_ns += LOOK_NS + 1
+    woke_ns = clocks.now_ns
+    assert wall.at(4 * S, now_ns=woke_ns) == EPOCH_NS + 4 * S, "it was then"
+    assert wall.at(woke_ns + 1, now_ns=woke_ns) == EPOCH_NS + slept_ns + woke_ns + 1
+    assert wall.steps == 0
+    assert "asleep for 3600.000 s" in caplog.text
+    # That the clock is set just afterwards is a step all the same.
+    clocks.offset_ns -= S // 4
+    clocks.now_ns += LOOK_NS + 1
+    assert wall.at(clocks.now_ns, now_ns=clocks.now_ns) == clocks.now_ns + clocks.offset_ns
+    assert wall.steps == 1
+
+
+def test_what_came_before_the_host_slept_is_no_fresher_than_that(
+    stamps: KernelStamps, wall: WallClock, clocks: Clocks
+) -> None:
+    stamps.monotonic_of_ns(EPOCH_NS + clocks.now_ns, clocks.now_ns)
+    came_ns = clocks.now_ns + 1_000_000
+    clocks.now_ns += 10_000_000
+    clocks.sleep(3600 * S)
+    clocks.now_ns += 5_000_000
+    read_ns = clocks.now_ns
+    fresh_ns = read_ns - 40_000
+    told_ns = EPOCH_NS + came_ns, clocks.offset_ns + fresh_ns
+    assert [stamps.monotonic_of_ns(one, read_ns) for one in told_ns] == [came_ns, fresh_ns]
+    assert stamps.monotonic_of_all(np.array(told_ns), read_ns).tolist() == [came_ns, fresh_ns]
+    assert wall.at(came_ns, now_ns=read_ns) == EPOCH_NS + came_ns
 
 
 def test_kernel_stamps_become_monotonic(stamps: KernelStamps, clocks: Clocks) -> None:
