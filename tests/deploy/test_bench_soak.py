@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,7 +30,7 @@ from palpate_deploy.bench.growth import (
     use_of,
     verdict_of,
 )
-from palpate_deploy.bench.soak import SoakResult, _Client
+from palpate_deploy.bench.soak import SoakResult, _Client, _Watch
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -233,3 +234,25 @@ def test_soak_watches_a_whole_station(palpate: Palpate, tmp_path: Path) -> None:
     assert values["received"]["electrodes"] > 1000
     assert 0 < values["disk_peak_mb"] <= values["disk_limit_mb"]
     assert out.with_suffix(".png").stat().st_size > 10_000
+
+
+def test_counters_that_are_not_told_at_the_end_are_lost_and_the_rest_of_the_run_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    profile = soak.soak_profile(tmp_path, 1, fem=False)
+    told = SimpleNamespace(counters={"frames": 1})
+    names = set(profile.processes) - {"router"}
+    monkeypatch.setattr(
+        soak,
+        "ask_status",
+        lambda *_, **__: [SimpleNamespace(service=one, **vars(told)) for one in names],
+    )
+    client = SimpleNamespace(received={}, lost=lambda: Counter[str]())
+    watched = _Watch(os.getpid(), profile, cast("Session", None), cast("_Client", client), 0.0)
+    for _ in range(2 * BINS + 2):
+        watched.look()
+        time.sleep(0.01)
+    names.remove("features")
+    result = watched.result(1)
+    assert result.lost == {"features counters lost: no answer": 1}
+    assert not result.met
