@@ -6,9 +6,10 @@ On disk: HDF5 schema ``palpate.features`` version 1, written whole or not at all
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -264,6 +265,66 @@ def check_rest(rest: npt.NDArray[np.floating], rows: npt.NDArray[np.int64], name
             f"{name}: the rest of E{electrode + 1} is {rest[row, electrode]:g} in row"
             f" {rows[row]}, not untouched counts (0 to {COUNTS_MAX}, not all 0)",
             remedy="give raw counts of the untouched BioTac, nothing subtracted or scaled",
+        )
+
+
+def check_counts(counts: npt.NDArray[Any], rows: npt.NDArray[np.int64], name: str) -> None:
+    """Refuse electrodes that are no raw counts; arguments as of ``check_rest``.
+
+    Raises:
+        DatasetError: One is not a whole number from 0 to ``COUNTS_MAX``.
+    """
+    values = counts.astype(np.float64)
+    bad = ~((values >= 0.0) & (values <= COUNTS_MAX))  # what is not a number is neither
+    bad[~bad] = np.abs(values[~bad] - np.rint(values[~bad])) > 1e-6
+    if bad.any():
+        row, electrode = (int(index) for index in np.argwhere(bad)[0])
+        raise DatasetError(
+            f"{name}: E{electrode + 1} reads {values[row, electrode]:g} in row {rows[row]},"
+            f" not whole counts from 0 to {COUNTS_MAX}",
+            remedy="give raw counts as the BioTac sends them, nothing subtracted or scaled",
+        )
+
+
+def electrodes_at_ends(data: FeatureDataset) -> dict[str, dict[str, int]]:
+    """In how many rows electrodes stand at an end of the converter's range, within a count.
+
+    Such an electrode is lost, or pressed beyond what its BioTac can measure.
+
+    Returns:
+        By sensor, and of each by electrode, ``E1`` to ``E19``; none that never does.
+    """
+    ends = (data.electrodes <= 1) | (data.electrodes >= COUNTS_MAX - 1)
+    found = {}
+    for number in np.unique(data.sensor[ends.any(axis=1)]):
+        rows = ends[data.sensor == number].sum(axis=0)
+        found[data.sensor_names[number]] = {
+            f"E{electrode + 1}": int(rows[electrode]) for electrode in np.flatnonzero(rows)
+        }
+    return found
+
+
+def check_order(arrays: Mapping[str, Any], rows: npt.NDArray[np.int64], name: str) -> None:
+    """Refuse rows of a sensor and group that are not in order of time.
+
+    Args:
+        arrays: ``sensor``, ``group`` and ``time_ns`` of each row.
+        rows: Their numbers in the file, shape ``(N,)``.
+        name: Of the file.
+
+    Raises:
+        DatasetError: It is so: its neighbours in time might be learned from while it is tested.
+    """
+    order = np.lexsort((np.arange(len(rows)), arrays["group"], arrays["sensor"]))
+    same = np.ones(len(rows) - 1, np.bool_)
+    for label in ("sensor", "group"):
+        same &= np.diff(arrays[label][order]) == 0
+    back = np.flatnonzero(same & (np.diff(arrays["time_ns"][order]) < 0))
+    if back.size:
+        raise DatasetError(
+            f"{name}: row {rows[order[back[0] + 1]]} is earlier than the one before it of the"
+            f" same press ({back.size} rows in all)",
+            remedy="sort the rows by sensor and time",
         )
 
 

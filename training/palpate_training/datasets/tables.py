@@ -22,7 +22,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from palpate import __version__
 from palpate.errors import ConfigError, DatasetError
-from palpate.messages import COUNTS_MAX
 from palpate.process import require
 from palpate_training.datasets.container import Provenance, sha256_of
 from palpate_training.datasets.export import written_new
@@ -31,7 +30,9 @@ from palpate_training.datasets.features import (
     FEATURE_COLUMNS,
     OF_CONTACT,
     FeatureDataset,
+    check_counts,
     check_forces,
+    check_order,
     check_rest,
     cut_into_blocks,
 )
@@ -322,7 +323,8 @@ def dataset_of(
     rows = len(arrays["electrodes"])
     kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
     arrays = {name: array[kept] for name, array in arrays.items()}
-    arrays["electrodes"] = _counts(arrays["electrodes"], np.flatnonzero(kept), source)
+    check_counts(arrays["electrodes"], np.flatnonzero(kept), str(source))
+    arrays["electrodes"] = np.rint(arrays["electrodes"])
     if "baseline" not in arrays:
         arrays["baseline"] = _rest(arrays, columns.rest_rows, np.flatnonzero(kept), source)
     check_rest(arrays["baseline"], np.flatnonzero(kept), str(source))
@@ -330,7 +332,7 @@ def dataset_of(
     across = columns.groups_across_sensors
     arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
     if "time_ns" in arrays:
-        _check_order(arrays, np.flatnonzero(kept), source)
+        check_order(arrays, np.flatnonzero(kept), str(source))
     left_out = rows - len(arrays["electrodes"])
     known = _provenance(table)
     return FeatureDataset(
@@ -392,40 +394,6 @@ def _complete(
     if not kept.any():
         raise DatasetError(f"{source}: no row is complete", remedy="see which columns are empty")
     return kept
-
-
-def _check_order(arrays: Mapping[str, Any], rows: npt.NDArray[np.int64], source: Path) -> None:
-    """Refuse a press whose rows are not in order of time; ``rows`` are those of the table.
-
-    Raises:
-        DatasetError: It is so: its neighbours in time might be learned from while it is tested.
-    """
-    order = np.lexsort((np.arange(len(rows)), arrays["group"], arrays["sensor"]))
-    same = np.ones(len(rows) - 1, np.bool_)
-    for name in ("sensor", "group"):
-        same &= np.diff(arrays[name][order]) == 0
-    back = np.flatnonzero(same & (np.diff(arrays["time_ns"][order]) < 0))
-    if back.size:
-        raise DatasetError(
-            f"{source}: row {rows[order[back[0] + 1]]} is earlier than the one before it of the"
-            f" same press ({back.size} rows in all)",
-            remedy="sort the table by sensor and time",
-        )
-
-
-def _counts(values: Values, rows: npt.NDArray[np.int64], source: Path) -> Values:
-    """Electrodes, as whole counts; ``rows`` are those of the table."""
-    counts = np.rint(values)
-    bad = np.abs(values - counts) > 1e-6
-    bad |= (values < 0.0) | (values > COUNTS_MAX)
-    if bad.any():
-        row, electrode = (int(index) for index in np.argwhere(bad)[0])
-        raise DatasetError(
-            f"{source}: E{electrode + 1} reads {values[row, electrode]:g} in row {rows[row]},"
-            f" not whole counts from 0 to {COUNTS_MAX}",
-            remedy="give raw counts as the BioTac sends them, nothing subtracted or scaled",
-        )
-    return np.asarray(counts)
 
 
 def _rest(
