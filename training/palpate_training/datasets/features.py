@@ -51,7 +51,8 @@ ELECTRODES = 19
 class FeatureDataset:
     """Rows of electrodes with the force, and where known the contact location, at the same time.
 
-    Rows are in order of time within one sensor. Checked on construction (``DatasetError``).
+    The rows that a sensor has of a group are in order of time. Checked on construction
+    (``DatasetError``).
 
     Attributes:
         electrodes: Raw counts [counts], uint16, shape ``(N, 19)``.
@@ -169,10 +170,18 @@ NOMINAL_PERIOD_S = 0.01
 
 
 def period_of(time_ns: TimeArray | None) -> float:
-    """Time between two rows of a sensor [s], the median; ``time_ns`` is that of its rows."""
-    steps = np.zeros(0) if time_ns is None else 1e-9 * np.diff(time_ns.astype(np.float64))
+    """Time between two rows of a sensor [s], the median; ``time_ns`` is that of its rows.
+
+    Rows that came together, and share their time, share the step to the next one.
+    """
+    if time_ns is None:
+        return NOMINAL_PERIOD_S
+    steps = 1e-9 * np.diff(time_ns.astype(np.float64))
     forward = steps[steps > 0.0]
-    return float(np.median(forward)) if len(forward) else NOMINAL_PERIOD_S
+    if not len(forward):
+        return NOMINAL_PERIOD_S
+    together = np.count_nonzero(steps == 0.0) / len(time_ns)
+    return float(np.median(forward)) * (1.0 - together)
 
 
 def recording_of(data: FeatureDataset) -> IndexArray:
@@ -420,6 +429,8 @@ def _check_values(data: FeatureDataset) -> None:
             f" {group[mixed[0] + 1]}",
             remedy="number blocks uniquely over all groups",
         )
+    if data.time_ns is not None:
+        check_order(data.arrays(), np.arange(len(data)), data.name)
 
 
 def check_learnable(data: FeatureDataset) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -300,7 +300,7 @@ def dataset_of(
         DatasetError: A column is missing, there twice, of another width, or holds something else; a
             number is missing; electrodes are no whole counts, the rest no counts; a force is beyond
             ``FORCE_MOST_N``; nothing says what electrodes read untouched; rows of a press are not
-            in order of time.
+            in order of time, or the time of a sensor stands still.
     """
     reader = TableColumns(table, source)
     arrays: dict[str, Any] = {
@@ -323,6 +323,9 @@ def dataset_of(
     rows = len(arrays["electrodes"])
     kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
     arrays = {name: array[kept] for name, array in arrays.items()}
+    there, arrays["sensor"] = np.unique(arrays["sensor"], return_inverse=True)
+    gone = [name for number, name in enumerate(names) if number not in there]
+    names = tuple(names[number] for number in there)
     check_counts(arrays["electrodes"], np.flatnonzero(kept), str(source))
     arrays["electrodes"] = np.rint(arrays["electrodes"])
     if "baseline" not in arrays:
@@ -333,7 +336,15 @@ def dataset_of(
     arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
     if "time_ns" in arrays:
         check_order(arrays, np.flatnonzero(kept), str(source))
-    left_out = rows - len(arrays["electrodes"])
+    ours = columns == ColumnMap.ours(table.column_names)
+    told = f"columns: {columns.model_dump_json(exclude_defaults=True)}"
+    notes = ["palpate's own columns" if ours else told]
+    if left_out := rows - len(arrays["electrodes"]):
+        notes.append(f"{left_out} incomplete rows left out")
+    if gone:
+        notes.append(f"no row is left of {', '.join(gone)}")
+    if "time_ns" in arrays and (repeated := _repeated_times(arrays, names, source)):
+        notes.append(f"{repeated} rows have the time of the row before")
     known = _provenance(table)
     return FeatureDataset(
         **{name: arrays[name].astype(FEATURE_COLUMNS[name].dtype) for name in arrays},
@@ -344,7 +355,7 @@ def dataset_of(
             input_sha256=sha256_of(source) if source.is_file() else "",
             licence=licence or known.get("licence") or "not stated",
             palpate_version=__version__,
-            notes="; ".join(_notes(columns, table.column_names, left_out)),
+            notes="; ".join(notes),
         ),
         name=str(source),
     )
@@ -363,13 +374,23 @@ def _provenance(table: pa.Table) -> dict[str, str]:
     return {name: "; ".join(map(str, filter(None, words))) for name, words in said.items()}
 
 
-def _notes(columns: ColumnMap, names: Sequence[str], left_out: int) -> Iterator[str]:
-    if columns == ColumnMap.ours(names):
-        yield "palpate's own columns"
-    else:
-        yield f"columns: {columns.model_dump_json(exclude_defaults=True)}"
-    if left_out:
-        yield f"{left_out} incomplete rows left out"
+def _repeated_times(arrays: Mapping[str, Any], names: Sequence[str], source: Path) -> int:
+    """Rows with the time of the row before of the same sensor.
+
+    Raises:
+        DatasetError: So have all rows of a sensor that has several: that is no time of the rows.
+    """
+    repeated = 0
+    for number, name in enumerate(names):
+        times = arrays["time_ns"][arrays["sensor"] == number]
+        same = np.count_nonzero(np.diff(times) == 0)
+        if 0 < same == len(times) - 1:
+            raise DatasetError(
+                f"{source}: time is the same in all {len(times)} rows of {name!r}",
+                remedy="name a column of times that go on from row to row, or none",
+            )
+        repeated += same
+    return repeated
 
 
 def _complete(
