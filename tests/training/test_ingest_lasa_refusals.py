@@ -94,6 +94,13 @@ def test_a_force_that_is_not_known(tmp_path: Path) -> None:
         ingest_lasa(archive(tmp_path, **arrays))
 
 
+def test_a_baseline_that_is_not_known(tmp_path: Path) -> None:
+    arrays = finger(9)
+    arrays["finger9_baseline_mean"][3] = np.nan
+    with pytest.raises(DatasetError, match="finger 9: baseline_mean of E4 is not finite"):
+        ingest_lasa(archive(tmp_path, **arrays))
+
+
 def test_untouched_rows_are_not_in_contact(tmp_path: Path) -> None:
     arrays = finger(9)
     arrays["finger9_force_N"][:30] = 0.1

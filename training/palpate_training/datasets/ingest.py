@@ -513,6 +513,11 @@ def _check_finger(
             )
     rows = np.arange(len(electrodes))
     check_counts(electrodes, rows, name)
+    if not np.isfinite(baseline).all():
+        raise DatasetError(
+            f"{name}: baseline_mean of E{np.isfinite(baseline).argmin() + 1} is not finite",
+            remedy="give the mean of untouched rows",
+        )
     unknown = np.flatnonzero(~np.isfinite(force).all(axis=1))
     if unknown.size:
         raise DatasetError(
