@@ -17,7 +17,13 @@ from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError
 from palpate_training.cli import data_app
-from palpate_training.datasets.features import FeatureDataset, open_dataset, write_dataset
+from palpate_training.datasets.features import (
+    FeatureDataset,
+    joined,
+    open_dataset,
+    period_of,
+    write_dataset,
+)
 from palpate_training.datasets.lerobot import export_lerobot, read_lerobot
 from palpate_training.datasets.tables import (
     ColumnMap,
@@ -491,3 +497,73 @@ def test_the_command_writes_each_form(data: FeatureDataset, tmp_path: Path) -> N
         arguments = ["export", str(tmp_path / "rows.h5"), str(tmp_path / "b"), *wrong]
         with pytest.raises(ConfigError):
             CliRunner().invoke(data_app, arguments, catch_exceptions=False)
+
+
+def timed(data: FeatureDataset, times: np.ndarray) -> FeatureDataset:
+    """One group of each sensor, with these times of all rows [ns]."""
+    return replace(
+        data, group=data.sensor.copy(), block=data.sensor.copy(), time_ns=times.astype(np.int64)
+    )
+
+
+def test_a_data_set_whose_times_go_back_is_refused(data: FeatureDataset) -> None:
+    assert data.time_ns is not None
+    with pytest.raises(DatasetError, match="row 1 is earlier than the one before it"):
+        timed(data, data.time_ns[::-1])
+    swapped = data.time_ns.copy()
+    swapped[[4, 5]] = swapped[[5, 4]]
+    with pytest.raises(DatasetError, match=r"row 5 is earlier .* \(1 rows in all\)"):
+        timed(data, swapped)
+
+
+def test_recordings_on_other_clocks_may_be_joined(data: FeatureDataset) -> None:
+    """Each recording is in order; the second may be earlier, as after a restart of the host."""
+    assert data.time_ns is not None
+    later = timed(data, data.time_ns)
+    force = data.force + np.float32(0.1)
+    earlier = replace(timed(data, data.time_ns - 10**18), force=force)
+    both = joined([later, earlier])
+    assert both.time_ns is not None
+    assert both.time_ns[0] > both.time_ns[-1]
+
+
+@pytest.mark.parametrize("together", [1, 2, 3])
+def test_rows_that_come_together_do_not_stretch_the_period(together: int) -> None:
+    rows = np.arange(600) // together * together
+    gap = 10**9 * (rows >= 300)
+    period_s = period_of(10**18 + rows * STEP_NS + gap)
+    assert period_s == pytest.approx(1e-9 * STEP_NS, rel=1e-3)
+
+
+def test_times_that_repeat_are_told(data: FeatureDataset) -> None:
+    rows = np.arange(len(data))
+    paired = timed(data, rows // 2 * 2 * STEP_NS)
+    table = table_of(paired)
+    found = dataset_of(table, ColumnMap.ours(table.column_names), source=Path("x"))
+    np.testing.assert_array_equal(found.time_ns, paired.time_ns)
+    same = len(data) // 2
+    assert f"{same} rows have the time of the row before" in found.provenance.notes
+
+
+def test_a_time_that_stands_still_is_refused(data: FeatureDataset) -> None:
+    last = data.sensor == len(data.sensor_names) - 1
+    times = np.where(last, 5, np.arange(len(data)) * STEP_NS)
+    table = table_of(timed(data, times))
+    told = f"time is the same in all {last.sum()} rows of '{data.sensor_names[-1]}'"
+    with pytest.raises(DatasetError, match=told):
+        dataset_of(table, ColumnMap.ours(table.column_names), source=Path("x"))
+
+
+def test_a_sensor_that_has_lost_all_its_rows_is_named_no_more(data: FeatureDataset) -> None:
+    force = np.where(data.sensor == 1, np.nan, data.force[:, 0])
+    table = table_of(data)
+    table = table.set_column(table.column_names.index("force_x_n"), "force_x_n", pa.array(force))
+    found = dataset_of(
+        table, ColumnMap.ours(table.column_names), source=Path("x"), drop_incomplete=True
+    )
+    one, gone, three = data.sensor_names
+    assert found.sensor_names == (one, three)
+    assert np.array(found.sensor_names)[found.sensor].tolist() == [
+        data.sensor_names[sensor] for sensor in data.sensor if sensor != 1
+    ]
+    assert f"no row is left of {gone}" in found.provenance.notes

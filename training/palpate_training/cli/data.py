@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,6 +23,7 @@ from palpate_training.datasets.features import (
     FEATURE_COLUMNS,
     FEATURES_SCHEMA,
     FeatureDataset,
+    electrodes_at_ends,
     joined,
     open_dataset,
     write_dataset,
@@ -40,6 +43,9 @@ from palpate_training.datasets.tables import ColumnMap, dataset_of, export_table
 from palpate_training.datasets.trials import TRIALS_SCHEMA
 
 console = Console()
+
+SENSORS_TOLD = 4
+"""Sensors of a data set whose electrodes at an end of the range are told one by one."""
 
 DataArgument = Annotated[
     Path, typer.Argument(help="Data set (.h5), or folder of published files (biotac1.hdf5, ...).")
@@ -65,6 +71,10 @@ def data_ingest_lasa(
     lag_rows: Annotated[
         int, typer.Option(min=0, help="Rows by which electrodes lag the force; 0 = as stored.")
     ] = ELECTRODE_LAG_ROWS,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option(min=1.0, max=1e4, help="Rows a second; none = 100 are assumed, as LASA has."),
+    ] = None,
 ) -> None:
     """LASA force calibration (real BioTacs) -> data set. Its rows may not be redistributed.
 
@@ -76,6 +86,7 @@ def data_ingest_lasa(
         command=typed_command(),
         blocks_per_recording=blocks,
         lag_rows=lag_rows,
+        rate_hz=rate_hz,
     )
     write_dataset(out, data)
     console.print(contents(data, str(out)))
@@ -356,9 +367,20 @@ def _features_summary(data: FeatureDataset) -> dict[str, Any]:
             }
             for name, array in data.arrays().items()
         },
+        "at_end_of_range": electrodes_at_ends(data),
         "content_sha256": data.content_sha256(),
         "provenance": asdict(data.provenance),
     }
+
+
+def _told_ends(data: FeatureDataset) -> Iterator[str]:
+    """Electrodes at an end of the converter's range, a line for each of the first sensors."""
+    ends = electrodes_at_ends(data)
+    for sensor, electrodes in itertools.islice(ends.items(), SENSORS_TOLD):
+        told = ", ".join(f"{name} in {rows} rows" for name, rows in electrodes.items())
+        yield f"[yellow]at an end of the converter's range: {sensor}: {told}[/]"
+    if len(ends) > SENSORS_TOLD:
+        yield f"[yellow]and electrodes of {len(ends) - SENSORS_TOLD} more sensors[/]"
 
 
 def contents(data: FeatureDataset, title: str) -> Table:
@@ -373,6 +395,7 @@ def contents(data: FeatureDataset, title: str) -> Table:
         f"made by: {where.command or '-'} (palpate {where.palpate_version})",
         f"notes: {where.notes or '-'}",
         f"content sha256: {data.content_sha256()}",
+        *_told_ends(data),
     ]
     columns = ("dataset", "type", "shape", "unit"), ("min", "median", "max")
     table = new_table(title, lines, *columns)

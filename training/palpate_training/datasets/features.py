@@ -6,9 +6,10 @@ On disk: HDF5 schema ``palpate.features`` version 1, written whole or not at all
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -50,7 +51,8 @@ ELECTRODES = 19
 class FeatureDataset:
     """Rows of electrodes with the force, and where known the contact location, at the same time.
 
-    Rows are in order of time within one sensor. Checked on construction (``DatasetError``).
+    The rows that a sensor has of a group are in order of time. Checked on construction
+    (``DatasetError``).
 
     Attributes:
         electrodes: Raw counts [counts], uint16, shape ``(N, 19)``.
@@ -168,10 +170,18 @@ NOMINAL_PERIOD_S = 0.01
 
 
 def period_of(time_ns: TimeArray | None) -> float:
-    """Time between two rows of a sensor [s], the median; ``time_ns`` is that of its rows."""
-    steps = np.zeros(0) if time_ns is None else 1e-9 * np.diff(time_ns.astype(np.float64))
+    """Time between two rows of a sensor [s], the median; ``time_ns`` is that of its rows.
+
+    Rows that came together, and share their time, share the step to the next one.
+    """
+    if time_ns is None:
+        return NOMINAL_PERIOD_S
+    steps = 1e-9 * np.diff(time_ns.astype(np.float64))
     forward = steps[steps > 0.0]
-    return float(np.median(forward)) if len(forward) else NOMINAL_PERIOD_S
+    if not len(forward):
+        return NOMINAL_PERIOD_S
+    together = np.count_nonzero(steps == 0.0) / len(time_ns)
+    return float(np.median(forward)) * (1.0 - together)
 
 
 def recording_of(data: FeatureDataset) -> IndexArray:
@@ -267,6 +277,66 @@ def check_rest(rest: npt.NDArray[np.floating], rows: npt.NDArray[np.int64], name
         )
 
 
+def check_counts(counts: npt.NDArray[Any], rows: npt.NDArray[np.int64], name: str) -> None:
+    """Refuse electrodes that are no raw counts; arguments as of ``check_rest``.
+
+    Raises:
+        DatasetError: One is not a whole number from 0 to ``COUNTS_MAX``.
+    """
+    values = counts.astype(np.float64)
+    bad = ~((values >= 0.0) & (values <= COUNTS_MAX))  # what is not a number is neither
+    bad[~bad] = np.abs(values[~bad] - np.rint(values[~bad])) > 1e-6
+    if bad.any():
+        row, electrode = (int(index) for index in np.argwhere(bad)[0])
+        raise DatasetError(
+            f"{name}: E{electrode + 1} reads {values[row, electrode]:g} in row {rows[row]},"
+            f" not whole counts from 0 to {COUNTS_MAX}",
+            remedy="give raw counts as the BioTac sends them, nothing subtracted or scaled",
+        )
+
+
+def electrodes_at_ends(data: FeatureDataset) -> dict[str, dict[str, int]]:
+    """In how many rows electrodes stand at an end of the converter's range, within a count.
+
+    Such an electrode is lost, or pressed beyond what its BioTac can measure.
+
+    Returns:
+        By sensor, and of each by electrode, ``E1`` to ``E19``; none that never does.
+    """
+    ends = (data.electrodes <= 1) | (data.electrodes >= COUNTS_MAX - 1)
+    found = {}
+    for number in np.unique(data.sensor[ends.any(axis=1)]):
+        rows = ends[data.sensor == number].sum(axis=0)
+        found[data.sensor_names[number]] = {
+            f"E{electrode + 1}": int(rows[electrode]) for electrode in np.flatnonzero(rows)
+        }
+    return found
+
+
+def check_order(arrays: Mapping[str, Any], rows: npt.NDArray[np.int64], name: str) -> None:
+    """Refuse rows of a sensor and group that are not in order of time.
+
+    Args:
+        arrays: ``sensor``, ``group`` and ``time_ns`` of each row.
+        rows: Their numbers in the file, shape ``(N,)``.
+        name: Of the file.
+
+    Raises:
+        DatasetError: It is so: its neighbours in time might be learned from while it is tested.
+    """
+    order = np.lexsort((np.arange(len(rows)), arrays["group"], arrays["sensor"]))
+    same = np.ones(len(rows) - 1, np.bool_)
+    for label in ("sensor", "group"):
+        same &= np.diff(arrays[label][order]) == 0
+    back = np.flatnonzero(same & (np.diff(arrays["time_ns"][order]) < 0))
+    if back.size:
+        raise DatasetError(
+            f"{name}: row {rows[order[back[0] + 1]]} is earlier than the one before it of the"
+            f" same press ({back.size} rows in all)",
+            remedy="sort the rows by sensor and time",
+        )
+
+
 FORCE_MOST_N = 300.0
 """A longer force is no reading of a fingertip's, or not in newtons [N]. A BioTac breaks far below,
 and a zeroed force/torque sensor is off by some newtons; but a press that counts, of 0.5 N, is 500
@@ -359,6 +429,8 @@ def _check_values(data: FeatureDataset) -> None:
             f" {group[mixed[0] + 1]}",
             remedy="number blocks uniquely over all groups",
         )
+    if data.time_ns is not None:
+        check_order(data.arrays(), np.arange(len(data)), data.name)
 
 
 def check_learnable(data: FeatureDataset) -> None:

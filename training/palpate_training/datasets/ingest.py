@@ -41,7 +41,13 @@ from palpate.messages import (
 )
 from palpate.sampling import sample_offsets
 from palpate_training.datasets.container import Provenance, read_archive, sha256_of
-from palpate_training.datasets.features import ELECTRODES, FeatureDataset, cut_into_blocks
+from palpate_training.datasets.features import (
+    ELECTRODES,
+    FeatureDataset,
+    check_counts,
+    check_forces,
+    cut_into_blocks,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -334,13 +340,12 @@ lowers the error on validation blocks (training/LOG.md); 0 takes the rows as sto
 
 _LASA_ARRAYS = ("electrodes_raw", "baseline_mean", "force_N")
 
+_LASA_KEY = re.compile(rf"finger(0|[1-9][0-9]*)_({'|'.join(_LASA_ARRAYS)})")
+
 _NOTES = (
     "force rotated from the authors' axes (x lateral, y distal, z ventral) to the sensor frame:"
-    " (x, y, z) = (y, x, -z); always in contact; no time stamps, about 100 Hz"
+    " (x, y, z) = (y, x, -z)"
 )
-
-
-_LASA_KEY = re.compile(r"finger(\d+)_electrodes_raw")
 
 
 def ingest_lasa(
@@ -350,8 +355,11 @@ def ingest_lasa(
     command: str = "",
     blocks_per_recording: int = BLOCKS_PER_RECORDING,
     lag_rows: int = ELECTRODE_LAG_ROWS,
+    rate_hz: float | None = None,
 ) -> FeatureDataset:
     """Read ``force_calibration.npz``: one recording (group) of each finger, in order of time.
+
+    Rows with a force above ``TOUCH_N`` are in contact.
 
     Args:
         path: The archive: ``fingerN_electrodes_raw`` [counts], ``fingerN_baseline_mean`` [counts]
@@ -360,29 +368,38 @@ def ingest_lasa(
         command: The command line, for provenance.
         blocks_per_recording: Contiguous pieces each recording is cut into.
         lag_rows: Electrodes of a row are paired with the force so many rows before.
+        rate_hz: Rows a second, of which ``time_ns`` is made; None = no times, so what reads the
+            rows takes them for 100 Hz, as LASA's are.
 
     Raises:
-        DatasetError: The archive is missing, damaged, or not this one; it lacks a finger; a
-            finger's arrays do not fit together, or it is named twice.
+        DatasetError: The archive is missing, damaged, or not this one; it lacks a finger or one of
+            its arrays; a finger's arrays do not fit together, or hold what is no raw count or no
+            fingertip's force in newtons; a finger is named twice.
     """
     if len(set(fingers)) < len(fingers):
         raise DatasetError(
             f"a finger is named twice: {', '.join(map(str, fingers))}", remedy="name each once"
         )
     remedy = "give the archive force_calibration.npz of the LASA force calibration"
-    chosen: list[int] = []
+    held: list[str] = []
 
-    def names(held: Sequence[str]) -> list[str]:
-        found = sorted(int(match[1]) for key in held if (match := _LASA_KEY.fullmatch(key)))
-        chosen.extend(fingers or found or (1,))  # of an archive without any, 1 is missing
-        return [f"finger{finger}_{what}" for finger in chosen for what in _LASA_ARRAYS]
+    def names(there: Sequence[str]) -> list[str]:
+        held.extend(there)
+        return [
+            name
+            for name in there
+            if (match := _LASA_KEY.fullmatch(name)) and (not fingers or int(match[1]) in fingers)
+        ]
 
-    arrays = iter(read_archive(path, names, remedy=remedy).values())
+    arrays = read_archive(path, names, remedy=remedy)
+    chosen = _fingers_held(path, held, fingers)
     parts = []
-    for finger, electrodes, baseline, theirs in zip(chosen, arrays, arrays, arrays, strict=True):
-        shapes = electrodes.shape, baseline.shape, theirs.shape
-        rows_of_finger = len(electrodes)
-        if shapes != ((rows_of_finger, ELECTRODES), (ELECTRODES,), (rows_of_finger, 3)):
+    for finger in chosen:
+        own = [arrays[f"finger{finger}_{what}"] for what in _LASA_ARRAYS]
+        electrodes, baseline, theirs = own
+        rows_of_finger = len(electrodes) if electrodes.ndim else 0
+        wanted = (rows_of_finger, ELECTRODES), (ELECTRODES,), (rows_of_finger, 3)
+        if (shapes := tuple(array.shape for array in own)) != wanted:
             raise DatasetError(
                 f"{path}: arrays of finger {finger} have shapes {shapes}, not (N, 19), (19,),"
                 " (N, 3)",
@@ -394,11 +411,23 @@ def ingest_lasa(
                 f" lag and {blocks_per_recording} blocks",
                 remedy="cut it into fewer blocks",
             )
+        _check_finger(f"{path}: finger {finger}", electrodes, baseline, theirs)
         parts.append((electrodes[lag_rows:], baseline, theirs[: rows_of_finger - lag_rows]))
     rows = [len(electrodes) for electrodes, _, _ in parts]
     force = np.concatenate([theirs for _, _, theirs in parts]).astype(np.float32)
+    touching = np.linalg.norm(force, axis=1) > TOUCH_N
+    contact = f"in contact above {TOUCH_N:g} N: {touching.sum()} of {len(force)} rows"
+    notes = (
+        _NOTES,
+        "always in contact" if touching.all() else contact,
+        "no time stamps, about 100 Hz" if rate_hz is None else f"{rate_hz:g} Hz as told",
+        f"electrodes paired with the force {lag_rows} rows before",
+    )
+    row = np.concatenate([np.arange(n) for n in rows])
     return FeatureDataset(
-        electrodes=np.concatenate([electrodes for electrodes, _, _ in parts]).astype(np.uint16),
+        electrodes=np.rint(np.concatenate([electrodes for electrodes, _, _ in parts])).astype(
+            np.uint16
+        ),
         baseline=np.concatenate(
             [np.tile(baseline, (n, 1)) for n, (_, baseline, _) in zip(rows, parts, strict=True)]
         ).astype(np.float32),
@@ -412,14 +441,100 @@ def ingest_lasa(
         ).astype(np.int32),
         sensor=np.repeat(np.arange(len(rows), dtype=np.int32), rows),
         sensor_names=tuple(f"lasa-finger{finger}" for finger in chosen),
-        in_contact=np.ones(sum(rows), dtype=np.bool_),
+        in_contact=touching,
+        time_ns=None if rate_hz is None else np.rint(row * (1e9 / rate_hz)).astype(np.int64),
         provenance=Provenance(
             source=f"LASA force calibration (MiaoLi/syntouchcontact), {len(chosen)} real BioTac(s)",
             command=command,
             input_sha256=sha256_of(path),
             licence="none stated by the authors: measure, do not redistribute",
             palpate_version=__version__,
-            notes=f"{_NOTES}; electrodes paired with the force {lag_rows} rows before",
+            notes="; ".join(notes),
         ),
         name=str(path),
     )
+
+
+def _fingers_held(path: Path, names: Sequence[str], fingers: Sequence[int]) -> list[int]:
+    """The fingers to read: those asked for, or all of which an archive with these names has any.
+
+    Raises:
+        DatasetError: It lacks one of them, or one of its arrays.
+    """
+    held: dict[int, set[str]] = {}
+    for name in names:
+        if match := _LASA_KEY.fullmatch(name):
+            held.setdefault(int(match[1]), set()).add(name)
+    if not held:
+        raise DatasetError(
+            f"{path} holds no finger; it has: {', '.join(names[:12]) or 'nothing'}",
+            remedy="give arrays finger1_electrodes_raw, finger1_baseline_mean and finger1_force_N"
+            " (or of another number, without zeros in front)",
+        )
+    chosen = list(fingers) or sorted(held)
+    for finger in chosen:
+        if finger not in held:
+            raise DatasetError(
+                f"{path} has no finger {finger}; it has {', '.join(map(str, sorted(held)))}",
+                remedy="name one that it has: --finger",
+            )
+    lacking = {
+        finger: [
+            name for what in _LASA_ARRAYS if (name := f"finger{finger}_{what}") not in held[finger]
+        ]
+        for finger in chosen
+    }
+    for finger, missing in lacking.items():
+        if missing:
+            rest = " ".join(f"--finger {one}" for one in chosen if not lacking[one])
+            raise DatasetError(
+                f"{path}: finger {finger} lacks {', '.join(missing)}",
+                remedy="add it to the archive" + (f"; {rest} reads the rest" if rest else ""),
+            )
+    return chosen
+
+
+def _check_finger(
+    name: str,
+    electrodes: npt.NDArray[Any],
+    baseline: npt.NDArray[Any],
+    force: npt.NDArray[Any],
+) -> None:
+    """Refuse arrays of a finger that no BioTac and no force sensor in newtons send.
+
+    Raises:
+        DatasetError: It says which, and the row of the archive.
+    """
+    for what, array in zip(_LASA_ARRAYS, (electrodes, baseline, force), strict=True):
+        if array.dtype.kind not in "uif":
+            raise DatasetError(
+                f"{name}: {what} holds {array.dtype}, not real numbers",
+                remedy="save whole counts, and forces in newtons",
+            )
+    rows = np.arange(len(electrodes))
+    check_counts(electrodes, rows, name)
+    if not np.isfinite(baseline).all():
+        raise DatasetError(
+            f"{name}: baseline_mean of E{np.isfinite(baseline).argmin() + 1} is not finite",
+            remedy="give the mean of untouched rows",
+        )
+    unknown = np.flatnonzero(~np.isfinite(force).all(axis=1))
+    if unknown.size:
+        raise DatasetError(
+            f"{name}: force_N is not finite in row {unknown[0]} ({unknown.size} rows in all)",
+            remedy="drop these rows where the archive is made",
+        )
+    check_forces(force, rows, name)
+    if (most := np.linalg.norm(force.astype(np.float64), axis=1).max()) <= TOUCH_N:
+        raise DatasetError(
+            f"{name}: no force is above {TOUCH_N:g} N, the largest is {most:.3g} N",
+            remedy="give newtons, and presses",
+        )
+    mean = force.mean(axis=0, dtype=np.float64)
+    if mean[2] > TOUCH_N and mean[2] >= np.abs(mean).max():
+        _log.warning(
+            "%s: the mean force along z is %.3g N, that of a finger pressed on its nail; if its pad"
+            " was pressed, turn the sign of force_N round",
+            name,
+            -mean[2],
+        )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -22,7 +22,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from palpate import __version__
 from palpate.errors import ConfigError, DatasetError
-from palpate.messages import COUNTS_MAX
 from palpate.process import require
 from palpate_training.datasets.container import Provenance, sha256_of
 from palpate_training.datasets.export import written_new
@@ -31,7 +30,9 @@ from palpate_training.datasets.features import (
     FEATURE_COLUMNS,
     OF_CONTACT,
     FeatureDataset,
+    check_counts,
     check_forces,
+    check_order,
     check_rest,
     cut_into_blocks,
 )
@@ -299,7 +300,7 @@ def dataset_of(
         DatasetError: A column is missing, there twice, of another width, or holds something else; a
             number is missing; electrodes are no whole counts, the rest no counts; a force is beyond
             ``FORCE_MOST_N``; nothing says what electrodes read untouched; rows of a press are not
-            in order of time.
+            in order of time, or the time of a sensor stands still.
     """
     reader = TableColumns(table, source)
     arrays: dict[str, Any] = {
@@ -322,7 +323,11 @@ def dataset_of(
     rows = len(arrays["electrodes"])
     kept = _complete(arrays, source, drop_incomplete=drop_incomplete)
     arrays = {name: array[kept] for name, array in arrays.items()}
-    arrays["electrodes"] = _counts(arrays["electrodes"], np.flatnonzero(kept), source)
+    there, arrays["sensor"] = np.unique(arrays["sensor"], return_inverse=True)
+    gone = [name for number, name in enumerate(names) if number not in there]
+    names = tuple(names[number] for number in there)
+    check_counts(arrays["electrodes"], np.flatnonzero(kept), str(source))
+    arrays["electrodes"] = np.rint(arrays["electrodes"])
     if "baseline" not in arrays:
         arrays["baseline"] = _rest(arrays, columns.rest_rows, np.flatnonzero(kept), source)
     check_rest(arrays["baseline"], np.flatnonzero(kept), str(source))
@@ -330,8 +335,16 @@ def dataset_of(
     across = columns.groups_across_sensors
     arrays |= _groups(arrays, labelled=columns.block is not None, across=across)
     if "time_ns" in arrays:
-        _check_order(arrays, np.flatnonzero(kept), source)
-    left_out = rows - len(arrays["electrodes"])
+        check_order(arrays, np.flatnonzero(kept), str(source))
+    ours = columns == ColumnMap.ours(table.column_names)
+    told = f"columns: {columns.model_dump_json(exclude_defaults=True)}"
+    notes = ["palpate's own columns" if ours else told]
+    if left_out := rows - len(arrays["electrodes"]):
+        notes.append(f"{left_out} incomplete rows left out")
+    if gone:
+        notes.append(f"no row is left of {', '.join(gone)}")
+    if "time_ns" in arrays and (repeated := _repeated_times(arrays, names, source)):
+        notes.append(f"{repeated} rows have the time of the row before")
     known = _provenance(table)
     return FeatureDataset(
         **{name: arrays[name].astype(FEATURE_COLUMNS[name].dtype) for name in arrays},
@@ -342,7 +355,7 @@ def dataset_of(
             input_sha256=sha256_of(source) if source.is_file() else "",
             licence=licence or known.get("licence") or "not stated",
             palpate_version=__version__,
-            notes="; ".join(_notes(columns, table.column_names, left_out)),
+            notes="; ".join(notes),
         ),
         name=str(source),
     )
@@ -361,13 +374,23 @@ def _provenance(table: pa.Table) -> dict[str, str]:
     return {name: "; ".join(map(str, filter(None, words))) for name, words in said.items()}
 
 
-def _notes(columns: ColumnMap, names: Sequence[str], left_out: int) -> Iterator[str]:
-    if columns == ColumnMap.ours(names):
-        yield "palpate's own columns"
-    else:
-        yield f"columns: {columns.model_dump_json(exclude_defaults=True)}"
-    if left_out:
-        yield f"{left_out} incomplete rows left out"
+def _repeated_times(arrays: Mapping[str, Any], names: Sequence[str], source: Path) -> int:
+    """Rows with the time of the row before of the same sensor.
+
+    Raises:
+        DatasetError: So have all rows of a sensor that has several: that is no time of the rows.
+    """
+    repeated = 0
+    for number, name in enumerate(names):
+        times = arrays["time_ns"][arrays["sensor"] == number]
+        same = np.count_nonzero(np.diff(times) == 0)
+        if 0 < same == len(times) - 1:
+            raise DatasetError(
+                f"{source}: time is the same in all {len(times)} rows of {name!r}",
+                remedy="name a column of times that go on from row to row, or none",
+            )
+        repeated += same
+    return repeated
 
 
 def _complete(
@@ -392,40 +415,6 @@ def _complete(
     if not kept.any():
         raise DatasetError(f"{source}: no row is complete", remedy="see which columns are empty")
     return kept
-
-
-def _check_order(arrays: Mapping[str, Any], rows: npt.NDArray[np.int64], source: Path) -> None:
-    """Refuse a press whose rows are not in order of time; ``rows`` are those of the table.
-
-    Raises:
-        DatasetError: It is so: its neighbours in time might be learned from while it is tested.
-    """
-    order = np.lexsort((np.arange(len(rows)), arrays["group"], arrays["sensor"]))
-    same = np.ones(len(rows) - 1, np.bool_)
-    for name in ("sensor", "group"):
-        same &= np.diff(arrays[name][order]) == 0
-    back = np.flatnonzero(same & (np.diff(arrays["time_ns"][order]) < 0))
-    if back.size:
-        raise DatasetError(
-            f"{source}: row {rows[order[back[0] + 1]]} is earlier than the one before it of the"
-            f" same press ({back.size} rows in all)",
-            remedy="sort the table by sensor and time",
-        )
-
-
-def _counts(values: Values, rows: npt.NDArray[np.int64], source: Path) -> Values:
-    """Electrodes, as whole counts; ``rows`` are those of the table."""
-    counts = np.rint(values)
-    bad = np.abs(values - counts) > 1e-6
-    bad |= (values < 0.0) | (values > COUNTS_MAX)
-    if bad.any():
-        row, electrode = (int(index) for index in np.argwhere(bad)[0])
-        raise DatasetError(
-            f"{source}: E{electrode + 1} reads {values[row, electrode]:g} in row {rows[row]},"
-            f" not whole counts from 0 to {COUNTS_MAX}",
-            remedy="give raw counts as the BioTac sends them, nothing subtracted or scaled",
-        )
-    return np.asarray(counts)
 
 
 def _rest(
