@@ -383,7 +383,7 @@ def _repeated_times(arrays: Mapping[str, Any], names: Sequence[str], source: Pat
     repeated = 0
     for number, name in enumerate(names):
         times = arrays["time_ns"][arrays["sensor"] == number]
-        same = np.count_nonzero(np.diff(times) == 0)
+        same = int(np.count_nonzero(np.diff(times) == 0))
         if 0 < same == len(times) - 1:
             raise DatasetError(
                 f"{source}: time is the same in all {len(times)} rows of {name!r}",
