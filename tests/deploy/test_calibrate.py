@@ -364,7 +364,7 @@ def test_a_data_set_is_of_the_finger_that_is_named(palpate: Palpate, tmp_path: P
     shutil.copy(tmp_path / "one.h5", tmp_path / "copy.h5")
     one = of_sensor(two, "biotac-2")
     write_dataset(tmp_path / "tared.h5", replace(one, baseline=one.baseline + np.float32(3.0)))
-    first = {name: rows[: len(one) // 2] for name, rows in one.arrays().items()}
+    first: dict[str, Any] = {name: rows[: len(one) // 2] for name, rows in one.arrays().items()}
     write_dataset(tmp_path / "part.h5", replace(one, **first))
     (tmp_path / "lab.mcap.part").write_text("cut off")
 

@@ -351,8 +351,8 @@ def test_the_same_recording_is_recognised_whatever_was_made_of_it(changed: str) 
     elif changed == "tared otherwise":
         other = replace(data, baseline=data.baseline + np.float32(3.0))
     else:
-        other = replace(data, **{name: rows[300:500] for name, rows in data.arrays().items()})
-        other = replace(other, force=other.force + np.float32(0.01))
+        some: dict[str, Any] = {name: rows[300:500] for name, rows in data.arrays().items()}
+        other = replace(data, **some | {"force": some["force"] + np.float32(0.01)})
     (same,) = fingers_of(replace(other, sensor_names=("another name",)))
     with pytest.raises(DatasetError, match="hold the same presses"):
         run_transfer([finger(1)], same)

@@ -129,8 +129,9 @@ def refuse_same(names: Sequence[str], fingers: Sequence[Finger]) -> None:
     for one in fingers:
         counts = one.recording.electrodes
         # Rows without any signal are the same in many recordings.
-        told = one.recording.force.any(axis=1) & ~at_an_end(counts).all(axis=1)
-        parts.append((counts.astype(np.float32), told[:, None].astype(np.float32)))
+        lost = at_an_end(counts).all(axis=1, keepdims=True)
+        told = one.recording.force.any(axis=1, keepdims=True) & ~lost
+        parts.append((counts.astype(np.float32), np.asarray(told, np.float32)))
     refuse_repeated(names, parts)
 
 
