@@ -13,6 +13,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -374,6 +375,10 @@ def test_a_data_set_is_of_the_finger_that_is_named(palpate: Palpate, tmp_path: P
     write_dataset(tmp_path / "two.h5", two)
     write_dataset(tmp_path / "one.h5", of_sensor(two, "biotac-2"))
     shutil.copy(tmp_path / "one.h5", tmp_path / "copy.h5")
+    one = of_sensor(two, "biotac-2")
+    write_dataset(tmp_path / "tared.h5", replace(one, baseline=one.baseline + np.float32(3.0)))
+    first: dict[str, Any] = {name: rows[: len(one) // 2] for name, rows in one.arrays().items()}
+    write_dataset(tmp_path / "part.h5", replace(one, **first))
     (tmp_path / "lab.mcap.part").write_text("cut off")
 
     def refused(name: str, source: str, *options: str | Path) -> str:
@@ -384,9 +389,10 @@ def test_a_data_set_is_of_the_finger_that_is_named(palpate: Palpate, tmp_path: P
 
     for source in ("one.h5", "two.h5"):
         assert "holds no sensor 'nonsense'" in refused("nonsense", source)
-    for others in ("copy.h5", "two.h5"):
+    for others in ("copy.h5", "two.h5", "tared.h5", "part.h5"):
         said = refused("biotac-2", "one.h5", "--others", tmp_path / others)
-        assert "holds the same presses as" in said
+        assert "one.h5, biotac-2, the finger itself, and" in said
+        assert f"{others} hold the same presses" in said
     twice = ("--others", tmp_path / "one.h5", "--others", tmp_path / "copy.h5")
     assert "hold the same presses" in refused("biotac-1", "two.h5", *twice)
     assert "palpate recover" in refused("finger", "lab.mcap.part")

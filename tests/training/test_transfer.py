@@ -19,7 +19,15 @@ from palpate_training.cli import train_app
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.features import FeatureDataset, write_dataset
 from palpate_training.datasets.ingest import ingest_lasa
-from palpate_training.evaluation.transfer import Finger, fingers_of, run_transfer, worst_of
+from palpate_training.evaluation.transfer import (
+    Finger,
+    as_dict,
+    fingers_of,
+    remarks,
+    run_transfer,
+    summary,
+    worst_of,
+)
 from palpate_training.learning.twin_line import TwinLine, fit_line, read_line, write_line
 from palpate_training.systems import transfer
 from palpate_training.systems.transfer import FingerRecording, ForceTransfer, LabelledPresses
@@ -311,6 +319,83 @@ def test_without_a_press_an_unlike_finger_is_estimated_no_worse_than_by_a_consta
     assert not run_transfer([finger(1), of_its_kind], unlike)["unlike"]
 
 
+def test_electrodes_that_are_dead_do_not_make_a_finger_unlike_the_others() -> None:
+    data = invented(2)
+    for column in (data.electrodes, data.baseline):
+        column[:, [4, 12]] = 4095
+    (dead,) = fingers_of(data)
+    result = run_transfer([finger(1)], dead)
+    assert 0.8 < result["impedance_ratio"] < 1.25
+    assert not result["unlike"]
+    assert result["clipped"] == {"finger-2": {"E5": ROWS, "E13": ROWS}}
+
+
+@pytest.mark.parametrize("trained_on", [False, True])
+def test_an_electrode_at_an_end_of_its_range_is_told(trained_on: bool) -> None:
+    data = invented(2)
+    data.electrodes[100:, 4] = 4094
+    (died,), whole = fingers_of(data), finger(1)
+    result = run_transfer([died], whole) if trained_on else run_transfer([whole], died)
+    assert result["clipped"] == {"finger-2": {"E5": ROWS - 100}}
+    said = remarks(result)
+    assert "Electrodes of finger-2 are at an end of their range" in said[0]
+    assert f"E5 ({ROWS - 100})" in said[0]
+    assert remarks({**result, "clipped": {}, "signal_ratio": 1.0, "unlike": False}) == []
+
+
+@pytest.mark.parametrize("changed", ["paired otherwise", "tared otherwise", "in part"])
+def test_the_same_recording_is_recognised_whatever_was_made_of_it(changed: str) -> None:
+    data = invented(1)
+    if changed == "paired otherwise":
+        other = replace(data, force=np.roll(data.force, 2, axis=0))
+    elif changed == "tared otherwise":
+        other = replace(data, baseline=data.baseline + np.float32(3.0))
+    else:
+        some: dict[str, Any] = {name: rows[300:500] for name, rows in data.arrays().items()}
+        other = replace(data, **some | {"force": some["force"] + np.float32(0.01)})
+    (same,) = fingers_of(replace(other, sensor_names=("another name",)))
+    with pytest.raises(DatasetError, match="hold the same presses"):
+        run_transfer([finger(1)], same)
+
+
+def test_fingers_without_any_signal_in_some_rows_are_not_the_same() -> None:
+    lost = []
+    for seed in (1, 2):
+        data = invented(seed)
+        data.electrodes[:100] = 0
+        lost += fingers_of(data)
+    assert run_transfer(lost[:1], lost[1])["rows"] == ROWS
+
+
+@pytest.mark.parametrize(
+    ("changed", "problem"),
+    [
+        ({"force": 1e3}, "more than a fingertip bears"),
+        ({"force": 1e-3}, "largest force is .* N, and a press has 0.5 N"),
+        ({"force": 0.0}, "force is the same in all"),
+        ({"electrodes": 0}, "electrodes, tared, is the same in all"),
+    ],
+)
+def test_a_finger_that_tells_nothing_is_refused(changed: dict[str, float], problem: str) -> None:
+    data = invented(2)
+    times = {name: getattr(data, name) * np.float32(by) for name, by in changed.items()}
+    columns = {name: rows.astype(getattr(data, name).dtype) for name, rows in times.items()}
+    with pytest.raises(DatasetError, match=f"finger-2: .*{problem}"):
+        fingers_of(replace(data, **columns))
+
+
+def test_a_finger_may_be_untouched_for_half_of_its_recording() -> None:
+    data = invented(1)
+    data.force[: ROWS // 2] = 0.0
+    (late,) = fingers_of(data)
+    assert np.isfinite(run_transfer([late], finger(2))["interval_median_n"])
+
+
+def test_a_name_without_rows_is_no_finger() -> None:
+    data = replace(invented(1), sensor=np.ones(ROWS, np.int32), sensor_names=("none", "one"))
+    assert [one.name for one in fingers_of(data)] == ["one"]
+
+
 def test_what_cannot_be_tested_is_refused() -> None:
     one, two = finger(1), finger(2)
     with pytest.raises(
@@ -324,11 +409,16 @@ def test_what_cannot_be_tested_is_refused() -> None:
         run_transfer([one, part], two)
     with pytest.raises(DatasetError, match=f"hold the same presses: {ROWS} rows"):
         run_transfer([one, one], two)
-    with pytest.raises(DatasetError, match="8 presses of 2 s, 8 are to be labelled"):
-        run_transfer([one], two, shots=8)
+    with pytest.raises(DatasetError, match="8 presses of 2 s, 9 are to be labelled"):
+        run_transfer([one], two, shots=9)
+    # Of 8 presses none lies 1 s from 7 others.
+    with pytest.raises(
+        DatasetError, match=r"no row is left to test: 7 of 8 presses are labelled.*label fewer"
+    ):
+        run_transfer([one], two, shots=7)
     # Pieces of a second have no press of two; without labels none is needed.
     short = replace(two, recording=replace(two.recording, segment=np.arange(ROWS) // 100))
-    with pytest.raises(DatasetError, match=r"has 0 presses of 2 s, 1 are.*label at most 0,"):
+    with pytest.raises(DatasetError, match=r"has 0 presses of 2 s, 1 are.*label fewer"):
         run_transfer([one], short, shots=1)
     assert run_transfer([one], short)["rows"] == ROWS
 
@@ -337,16 +427,29 @@ def test_draws_are_reproducible_and_leave_the_labelled_rows_out() -> None:
     results = [run_transfer([finger(1)], finger(2), shots=3, draws=2) for _ in range(2)]
     assert results[0] == results[1]
     assert results[0]["rows"] == ROWS, "all that the finger has, whatever is drawn"
+    # Three presses of 200 rows, and up to 100 rows before and after each.
+    assert ROWS - 3 * 400 <= results[0]["tested_rows"] < ROWS - 3 * 200
     other = run_transfer([finger(1)], finger(2), shots=3, draws=2, seed=1)
     assert other["magnitude_median_n"] != results[0]["magnitude_median_n"]
 
 
-def test_the_worst_of_several_fingers_counts() -> None:
+def test_all_figures_are_those_of_the_worst_of_several_fingers() -> None:
     results = [run_transfer([finger(1)], finger(seed)) for seed in (2, 3)]
+    better, worse = sorted(results, key=lambda one: one["magnitude_median_n"])
+    better["constant"]["magnitude_median_n"] = better["angle_median_rad"] = 9.0
     worst = worst_of(results)
-    for key in ("magnitude_median_n", "angle_median_rad"):
-        assert worst[key] == max(one[key] for one in results)
+    assert worst["worst_finger"] == worse["test"]
+    assert {key: worst[key] for key in worse} == worse
     assert worst["fingers"] == {"finger-2": results[0], "finger-3": results[1]}
+
+
+def test_what_is_not_known_is_null_in_json() -> None:
+    untouched = summary(np.ones((9, 3)), np.zeros((9, 3)))
+    assert np.isnan(untouched["angle_median_rad"])
+    told = as_dict([{**untouched, "ridge": untouched, "rows": 9}])
+    assert told["angle_median_rad"] is told["ridge"]["angle_median_rad"] is None
+    assert told["rows"] == 9
+    assert told["magnitude_median_n"] == pytest.approx(np.sqrt(3.0))
 
 
 @pytest.mark.parametrize("shots", [0, 2])

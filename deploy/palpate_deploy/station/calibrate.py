@@ -37,6 +37,7 @@ from palpate_training import EXTRA_MODULES
 
 if TYPE_CHECKING:
     from palpate_training.datasets.features import FeatureDataset
+    from palpate_training.evaluation.transfer import Finger
     from palpate_training.learning.other_fingers import OtherFinger
     from palpate_training.tasks.finger import FingerReport
 
@@ -96,12 +97,12 @@ class _Others:
     Attributes:
         fingers: Their presses.
         serials: The serial numbers that are known of them, and where each was found.
-        digests: Of their rows, and likewise: the same rows may have another name.
+        rows: All their rows, and where each was found: the same ones may have another name.
     """
 
     fingers: list[OtherFinger]
     serials: dict[str, Path]
-    digests: dict[str, Path]
+    rows: list[tuple[Path, Finger]]
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> _Others:
@@ -109,39 +110,34 @@ class _Others:
 
         Raises:
             RecordingError: A record is damaged.
-            DatasetError: A file is no data set, or holds too few presses of a finger.
-            ConfigError: Two files hold the same presses.
+            DatasetError: A file is no data set, or holds too few presses of a finger; or two hold
+                the same presses.
         """
+        from palpate_training.evaluation.transfer import fingers_of, refuse_same
         from palpate_training.tasks.other_fingers import fingers_in
 
         fingers: list[OtherFinger] = []
         serials: dict[str, Path] = {}
-        digests: dict[str, Path] = {}
+        rows: list[tuple[Path, Finger]] = []
         for path in paths:
             data, own = _rows(path)
             fingers += fingers_in(data)
             serials |= dict.fromkeys(own, path)
-            for digest in _digests(data):
-                if (first := digests.setdefault(digest, path)) is not path:
-                    raise ConfigError(
-                        f"{first} and {path} hold the same presses",
-                        remedy="name each finger's presses once",
-                    )
-        return cls(fingers, serials, digests)
+            rows += [(path, finger) for finger in fingers_of(data)]
+        refuse_same([str(path) for path, _ in rows], [finger for _, finger in rows])
+        return cls(fingers, serials, rows)
 
     def check_rows(self, data: FeatureDataset) -> None:
         """Refuse presses that are among the others.
 
         Raises:
-            ConfigError: They are.
+            DatasetError: They are.
         """
-        for digest in _digests(data):
-            if digest in self.digests:
-                raise ConfigError(
-                    f"{self.digests[digest]} holds the same presses as {data.name}, the finger"
-                    " itself",
-                    remedy="leave it out of --others; --from learns from it",
-                )
+        from palpate_training.evaluation.transfer import fingers_of, refuse_same
+
+        own = [(f"{data.name}, the finger itself,", finger) for finger in fingers_of(data)]
+        both = [*self.rows, *own]
+        refuse_same([str(name) for name, _ in both], [finger for _, finger in both])
 
     def check(self, serial: str) -> None:
         """Refuse a finger that is among the others; an unknown serial number is none.
@@ -172,7 +168,7 @@ def calibrate_finger(
     Raises:
         LinkError: There is no router, or no such finger, or no force sensor for it, or no service
             to serve the bundle.
-        DatasetError: Too few presses.
+        DatasetError: Too few presses, or presses of the finger are among the others.
         BundleError: The bundle cannot be written.
         ConfigError: The order contradicts itself or the files that it names, or its folder or that
             of the bundles cannot be written.
@@ -285,13 +281,6 @@ def _rows(source: Path, sensor: str | None = None) -> tuple[FeatureDataset, list
         streams = {sensor: streams[sensor]}
     frames = (frame for each in streams.values() for frame in each.frames)
     return rows_of_streams(source, streams), sorted({f.sensor_serial for f in frames} - {""})
-
-
-def _digests(data: FeatureDataset) -> list[str]:
-    """Digest of the rows of each finger, whatever it is called."""
-    from palpate_training.evaluation.transfer import fingers_of
-
-    return [finger.digest for finger in fingers_of(data)]
 
 
 def _check_writable(folder: Path) -> None:

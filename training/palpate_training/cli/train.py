@@ -256,7 +256,13 @@ def train_transfer(
     train: Annotated[
         list[Path], typer.Option(help="Data set (.h5) of other fingers; may be repeated.")
     ],
-    test: Annotated[Path, typer.Option(help="Data set (.h5) of the finger that is tested.")],
+    test: Annotated[
+        Path,
+        typer.Option(
+            help="Data set (.h5) of the finger that is tested; of several, each is, and the JSON's "
+            "first figures are those of the one with the largest median error: worst_finger."
+        ),
+    ],
     shots: Annotated[int, typer.Option(min=0, help="Its presses with known forces.")] = 0,
     unlabelled: Annotated[
         bool | None,
@@ -287,13 +293,13 @@ def train_transfer(
     """
     from palpate_training.evaluation.transfer import (
         FIGURES,
+        as_dict,
         fingers_of,
+        remarks,
         run_transfer,
         steps_of,
-        worst_of,
     )
     from palpate_training.learning.twin_line import read_line
-    from palpate_training.systems.transfer import SAME_USE
 
     if line is not None and not twin:
         raise ConfigError(
@@ -319,7 +325,7 @@ def train_transfer(
             for finger in tested
         ]
     if as_json:
-        console.print_json(data=results[0] if len(results) == 1 else worst_of(results))
+        console.print_json(data=as_dict(results), allow_nan=False)
         return
     for result in results:
         names = ", ".join(result["train"])
@@ -334,18 +340,8 @@ def train_transfer(
             f"90 % intervals: half width {result['interval_median_n']:.2f} N,"
             f" hold {100 * result['coverage_90']:.0f} % of the true magnitudes"
         )
-        if result["unlike"]:
-            console.print(
-                f"{result['test']} is unlike the others: untouched, its impedance is"
-                f" {result['impedance_ratio']:.2g} times that of the nearest one. Only labelled"
-                " presses tell how sensitive it is: --shots 1 or more"
-            )
-        elif result["signal_ratio"] > SAME_USE:
-            console.print(
-                f"The signals of {result['test']} are {result['signal_ratio']:.2g} times as large"
-                " as those of the others. It is taken for more sensitive, not for pressed harder;"
-                " labelled presses tell: --shots 1 or more"
-            )
+        for remark in remarks(result):
+            console.print(remark)
 
 
 def train_features_command(

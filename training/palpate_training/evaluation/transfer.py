@@ -10,7 +10,6 @@ labelled press are not tested.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,16 +18,23 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.errors import DatasetError
-from palpate.files.hdf5 import add_array
 from palpate_training.datasets.container import refuse_repeated
-from palpate_training.datasets.features import FeatureDataset, period_of
+from palpate_training.datasets.features import (
+    FeatureDataset,
+    check_learnable,
+    of_sensor,
+    period_of,
+)
+from palpate_training.datasets.ingest import PRESS_N
 from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.metrics import force_errors
 from palpate_training.learning.splits import GUARD_S
 from palpate_training.learning.twin_line import TwinLine
+from palpate_training.systems.samples import at_an_end
 from palpate_training.systems.transfer import (
     ALIKE,
     LINE_VALIDATION,
+    SAME_USE,
     FingerRecording,
     ForceTransfer,
     LabelledPresses,
@@ -66,36 +72,67 @@ class Finger:
     recording: FingerRecording
     tared: npt.NDArray[np.float32]
 
-    @property
-    def digest(self) -> str:
-        """SHA-256 of its electrodes and forces, which tells the same rows under two names."""
-        digest = hashlib.sha256()
-        add_array(digest, "electrodes", np.asarray(self.recording.electrodes))
-        add_array(digest, "force", self.recording.force)
-        return digest.hexdigest()
+    def clipped(self) -> dict[str, int]:
+        """In how many rows each electrode that is ever at an end of its range is there."""
+        rows = at_an_end(self.recording.electrodes).sum(axis=0)
+        return {f"E{electrode + 1}": int(rows[electrode]) for electrode in np.flatnonzero(rows)}
 
 
 def fingers_of(data: FeatureDataset) -> list[Finger]:
-    """The fingers of a data set, each with all its rows."""
-    return [_finger(data, sensor) for sensor in range(len(data.sensor_names))]
+    """The fingers of a data set that have rows, each with all of them.
+
+    Raises:
+        DatasetError: Forces or electrodes of one never change, or its forces are not in newtons.
+    """
+    return [
+        _finger(of_sensor(data, name))
+        for sensor, name in enumerate(data.sensor_names)
+        if (data.sensor == sensor).any()
+    ]
 
 
-def _finger(data: FeatureDataset, sensor: int) -> Finger:
-    rows = np.flatnonzero(data.sensor == sensor)
-    group = data.group[rows]
-    broken = np.diff(group, prepend=group[:1]) != 0
-    time_ns = None if data.time_ns is None else data.time_ns[rows]
-    if time_ns is not None:
-        steps_s = 1e-9 * np.diff(time_ns.astype(np.float64))
+def _finger(data: FeatureDataset) -> Finger:
+    """The only finger of a data set."""
+    check_learnable(data)
+    if (most := float(np.linalg.norm(data.force, axis=1).max())) < PRESS_N:
+        raise DatasetError(
+            f"{data.name}: the largest force is {most:.2g} N, and a press has {PRESS_N:g} N",
+            remedy="give forces in newtons, of a finger that was pressed",
+        )
+    broken = np.diff(data.group, prepend=data.group[:1]) != 0
+    if data.time_ns is not None:
+        steps_s = 1e-9 * np.diff(data.time_ns.astype(np.float64))
         broken = np.concatenate([[False], (steps_s > GAP_S) | (steps_s < 0.0)])
     recording = FingerRecording(
-        data.electrodes[rows],
-        data.baseline[rows],
+        data.electrodes,
+        data.baseline,
         np.cumsum(broken),
-        period_of(time_ns),
-        data.force[rows].astype(np.float64),
+        period_of(data.time_ns),
+        data.force.astype(np.float64),
     )
-    return Finger(data.sensor_names[sensor], recording, data.tared_counts[rows])
+    return Finger(data.sensor_names[0], recording, data.tared_counts)
+
+
+def refuse_same(names: Sequence[str], fingers: Sequence[Finger]) -> None:
+    """Refuse fingers that have rows in common: they would count twice, and be tested on.
+
+    Raw counts of rows with a force tell them, whatever this force and the untouched counts are.
+
+    Args:
+        names: Of the fingers, for the error.
+        fingers: The fingers.
+
+    Raises:
+        DatasetError: Two have.
+    """
+    parts = []
+    for one in fingers:
+        counts = one.recording.electrodes
+        # Rows without any signal are the same in many recordings.
+        lost = at_an_end(counts).all(axis=1, keepdims=True)
+        told = one.recording.force.any(axis=1, keepdims=True) & ~lost
+        parts.append((counts.astype(np.float32), np.asarray(told, np.float32)))
+    refuse_repeated(names, parts)
 
 
 def first_seconds(finger: Finger, seconds: float, *, most: int) -> tuple[KnownRows, Floats, Rows]:
@@ -146,7 +183,9 @@ def run_transfer(
         the true magnitudes inside their 90 % intervals), ``interval_median_n`` (half its width),
         and in ``constant`` and ``ridge`` the first three of a constant and of a ridge regression
         that know the same forces; which finger, how many presses and draws; ``rows``, all that the
-        finger has: those within a second of a labelled press are not tested; ``impedance_ratio``,
+        finger has, and ``tested_rows``, those further than a second from every labelled press, in
+        the draw that leaves the fewest; ``clipped``, by name of the finger and of the electrode, in
+        how many rows an electrode is at an end of its range; ``impedance_ratio``,
         the finger's untouched impedance over that of the nearest one trained on, and ``unlike``,
         whether it is so far from 1 that nothing tells how sensitive this finger is (`ALIKE`). Then,
         without a press, every estimate is the others' mean force.
@@ -156,19 +195,13 @@ def run_transfer(
     Raises:
         DatasetError: Two fingers have presses in common, or the tested one has too few.
     """
-    refuse_repeated(
+    refuse_same(
         [*(f"{finger.name} (to train on)" for finger in train), f"{test.name} (to test)"],
-        [(finger.tared, finger.recording.force) for finger in (*train, test)],
+        [*train, test],
     )
-    pieces = _presses(test.recording)
-    if shots > (most := max(0, len(pieces) - 1)):
-        raise DatasetError(
-            f"{test.name!r} has {len(pieces)} presses of {PRESS_S:g} s, {shots} are to be labelled",
-            remedy=f"label at most {most}, so that some are left to test",
-        )
+    drawn = _draws(test, shots, draws if shots else 1, np.random.default_rng(seed))
     sources = [finger.recording for finger in train]
     width = _width_on_others(train, line, on_step)
-    rng = np.random.default_rng(seed)
     model = ForceTransfer(sources, line)
     on_step()
     plain = model.estimate(test.recording, unlabelled=unlabelled)
@@ -180,8 +213,7 @@ def run_transfer(
         width = _width(np.broadcast_to(mean, known.shape), known)
     on_step()
     found: dict[str, list[dict[str, float]]] = {"": [], "constant": [], "ridge": []}
-    for _ in range(draws if shots else 1):
-        labelled, tested = _draw(pieces, shots, test.recording, rng)
+    for labelled, tested in drawn:
         own_width = width
         force = plain
         if shots:
@@ -213,10 +245,12 @@ def run_transfer(
         "train": [finger.name for finger in train],
         "shots": shots,
         "unlabelled": unlabelled,
-        "draws": draws if shots else 1,
+        "draws": len(drawn),
         "seed": seed,
         "twin": line is not None,
         "rows": len(test.recording.force),
+        "tested_rows": min(len(tested) for _, tested in drawn),
+        "clipped": {one.name: rows for one in (*train, test) if (rows := one.clipped())},
         "impedance_ratio": ratio,
         "signal_ratio": float(model.signal_ratio(test.recording, whole=True)[-1]),
         "unlike": unlike,
@@ -229,12 +263,13 @@ def steps_of(train: int, *, shots: int, draws: int) -> int:
 
 
 def summary(estimate: Floats, truth: Floats) -> dict[str, float]:
-    """``FIGURES`` of estimated forces [N], each of shape (N, 3)."""
+    """``FIGURES`` of estimated forces [N], each of shape (N, 3); the angle NaN without a force."""
     errors = force_errors(estimate, truth)
+    angles = errors["angle_rad"][np.isfinite(errors["angle_rad"])]
     values = (
         np.median(errors["magnitude_n"]),
         np.percentile(errors["magnitude_n"], 95.0),
-        np.nanmedian(errors["angle_rad"]),
+        np.median(angles) if len(angles) else np.nan,
     )
     return dict(zip(FIGURES, map(float, values), strict=True))
 
@@ -247,6 +282,26 @@ def _presses(recording: FingerRecording) -> list[Rows]:
     for rows in np.split(np.arange(len(recording.segment)), starts):
         pieces += [rows[at : at + size] for at in range(0, len(rows) - size + 1, size)]
     return pieces
+
+
+def _draws(
+    test: Finger, shots: int, draws: int, rng: np.random.Generator
+) -> list[tuple[LabelledPresses, Rows]]:
+    """Labelled rows and rows to test, of each draw."""
+    pieces = _presses(test.recording)
+    if shots > len(pieces):
+        raise DatasetError(
+            f"{test.name!r} has {len(pieces)} presses of {PRESS_S:g} s, {shots} are to be labelled",
+            remedy="label fewer, so that some are left to test",
+        )
+    drawn = [_draw(pieces, shots, test.recording, rng) for _ in range(draws)]
+    if not all(len(tested) for _, tested in drawn):
+        raise DatasetError(
+            f"{test.name!r}: no row is left to test: {shots} of {len(pieces)} presses are labelled,"
+            f" and rows within {GUARD_S:g} s of them are not tested",
+            remedy="label fewer",
+        )
+    return drawn
 
 
 def _draw(
@@ -329,17 +384,50 @@ def baselines_of(
 
 
 def worst_of(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Of several tested fingers: the worst of each figure, and all of them by name."""
+    """Of several tested fingers: the one with the largest median error of the magnitude.
 
-    def worst(tables: Sequence[dict[str, Any]]) -> dict[str, float]:
-        return {key: max(table[key] for table in tables) for key in FIGURES}
+    Returns:
+        Its result, all figures of this one finger; its name, ``worst_finger``; and all results by
+        name of the finger, ``fingers``.
+    """
+    worst = max(results, key=lambda one: one["magnitude_median_n"])
+    fingers = {one["test"]: one for one in results}
+    return {**worst, "worst_finger": worst["test"], "fingers": fingers}
 
-    first = results[0]
-    return {
-        **worst(results),
-        "coverage_90": min(one["coverage_90"] for one in results),
-        "constant": worst([one["constant"] for one in results]),
-        "ridge": worst([one["ridge"] for one in results]),
-        **{key: first[key] for key in ("train", "shots", "unlabelled", "draws", "seed")},
-        "fingers": {one["test"]: one for one in results},
-    }
+
+def as_dict(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """For a JSON file: ``worst_of`` the results, or the only one; None where nothing is known."""
+
+    def known(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: known(each) for key, each in value.items()}
+        return None if isinstance(value, float) and not np.isfinite(value) else value
+
+    told: dict[str, Any] = known(results[0] if len(results) == 1 else worst_of(results))
+    return told
+
+
+def remarks(result: dict[str, Any]) -> list[str]:
+    """What a reader must know of the figures of a tested finger, in sentences."""
+    name, clipped = result["test"], result["clipped"]
+    told = []
+    for finger, electrodes in clipped.items():
+        rows = ", ".join(f"{electrode} ({count})" for electrode, count in electrodes.items())
+        told.append(
+            f"Electrodes of {finger} are at an end of their range, where they tell no force; in"
+            f" brackets, in how many rows: {rows}"
+        )
+    if result["unlike"]:
+        told.append(
+            f"{name} is unlike the others: untouched, its impedance is"
+            f" {result['impedance_ratio']:.2g} times that of the nearest one. Only labelled presses"
+            " tell how sensitive it is: --shots 1 or more"
+        )
+    elif result["signal_ratio"] > SAME_USE:
+        perhaps = ", perhaps by electrodes at an end of their range" if name in clipped else ""
+        told.append(
+            f"The signals of {name} are {result['signal_ratio']:.2g} times as large as those of the"
+            f" others{perhaps}. It is taken for more sensitive, not for pressed harder; labelled"
+            " presses tell: --shots 1 or more"
+        )
+    return told

@@ -45,7 +45,7 @@ from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
 from palpate_training.learning.baselines import AffineModel, ridge
 from palpate_training.learning.electrode_nets import MIRROR_AXES
 from palpate_training.learning.twin_line import TwinLine
-from palpate_training.systems.samples import counts_at, impedance_ohm
+from palpate_training.systems.samples import at_an_end, counts_at, impedance_ohm
 
 Floats = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.number]
@@ -203,8 +203,10 @@ class FingerRecording:
         return replace(self, electrodes=counts_at(impedance_ohm(self.baseline) * over_rest))
 
     def rest_log(self) -> float:
-        """Logarithm of the untouched impedance [ohm], mean over electrodes and rows."""
-        return float(np.log(impedance_ohm(self.baseline)).mean())
+        """Logarithm of the untouched impedance [ohm], mean over rows and electrodes that work."""
+        works = ~at_an_end(self.baseline)
+        rest = self.baseline[works] if works.any() else self.baseline
+        return float(np.log(impedance_ohm(rest)).mean())
 
     def mirrored(self) -> FingerRecording:
         """What the finger would have read, had all been its mirror image."""
@@ -310,7 +312,7 @@ class _Process:
                 targets.append(one.force[some] - known)
         self._rows = np.vstack(rows)
         force = np.vstack(targets)
-        self._unit = force.std()
+        self._unit = force.std() or 1.0
         covariance = kernel(self._rows, self._rows)
         covariance[np.diag_indices(len(covariance))] += NOISE
         self._weight = cho_solve(cho_factor(covariance, lower=True), force / self._unit)
@@ -523,13 +525,21 @@ class _ErrorProcess:
         known: Their forces [N], shape (M, 3).
     """
 
-    def __init__(self, recording: FingerRecording, rows: Floats, labelled: LabelledPresses) -> None:
+    def __init__(
+        self,
+        recording: FingerRecording,
+        rows: Floats,
+        labelled: LabelledPresses,
+        inverse: Floats | None = None,
+    ) -> None:
         self._recording, self._rows, self.labelled = recording, rows, labelled
         self.presses, self.known = np.unique(labelled.press), recording.force[labelled.rows]
-        same = labelled.press[:, None] == labelled.press
-        covariance = self._covariance(labelled.rows) + PRESS_VARIANCE_N2 * same
-        covariance[np.diag_indices(len(same))] += ROW_VARIANCE_N2
-        self._inverse = np.linalg.inv(covariance)
+        if inverse is None:
+            same = labelled.press[:, None] == labelled.press
+            covariance = self._covariance(labelled.rows) + PRESS_VARIANCE_N2 * same
+            covariance[np.diag_indices(len(same))] += ROW_VARIANCE_N2
+            inverse = np.linalg.inv(covariance)
+        self._inverse = inverse
 
     def misfit(self, estimate: Floats) -> float:
         """Squares of the labelled errors over their covariance; less is likelier."""
@@ -563,7 +573,12 @@ class _ErrorProcess:
         held_out = np.empty((len(self.labelled.rows), 3))
         for press in self.presses:
             own = self.labelled.press == press
-            others = _ErrorProcess(self._recording, self._rows, self.labelled.where(~own))
+            # The inverse without these rows follows from the whole one: M**2 steps, not M**3.
+            shared = self._inverse[np.ix_(own, ~own)]
+            less = shared.T @ np.linalg.solve(self._inverse[np.ix_(own, own)], shared)
+            inverse = self._inverse[np.ix_(~own, ~own)] - less
+            known = self.labelled.where(~own)
+            others = _ErrorProcess(self._recording, self._rows, known, inverse)
             held_out[own] = others.force(estimate(others), self.labelled.rows[own])
         return held_out
 
