@@ -295,22 +295,30 @@ def check_counts(counts: npt.NDArray[Any], rows: npt.NDArray[np.int64], name: st
         )
 
 
-def electrodes_at_ends(data: FeatureDataset) -> dict[str, dict[str, int]]:
-    """In how many rows electrodes stand at an end of the converter's range, within a count.
+def at_an_end(counts: npt.NDArray[np.number]) -> npt.NDArray[np.bool_]:
+    """Where counts are at an end of the converter's range, within a count; of the same shape.
 
     Such an electrode is lost, or pressed beyond what its BioTac can measure.
-
-    Returns:
-        By sensor, and of each by electrode, ``E1`` to ``E19``; none that never does.
     """
-    ends = (data.electrodes <= 1) | (data.electrodes >= COUNTS_MAX - 1)
-    found = {}
-    for number in np.unique(data.sensor[ends.any(axis=1)]):
-        rows = ends[data.sensor == number].sum(axis=0)
-        found[data.sensor_names[number]] = {
-            f"E{electrode + 1}": int(rows[electrode]) for electrode in np.flatnonzero(rows)
-        }
-    return found
+    return np.asarray((counts <= 1) | (counts >= COUNTS_MAX - 1))
+
+
+def rows_at_ends(counts: npt.NDArray[np.number]) -> dict[str, int]:
+    """In how many rows an electrode is at an end of the range, by ``E1`` to ``E19``.
+
+    Electrodes that never are have no entry. Counts of shape (N, 19).
+    """
+    rows = at_an_end(counts).sum(axis=0)
+    return {f"E{electrode + 1}": int(rows[electrode]) for electrode in np.flatnonzero(rows)}
+
+
+def electrodes_at_ends(data: FeatureDataset) -> dict[str, dict[str, int]]:
+    """``rows_at_ends`` of each sensor that has any, by its name."""
+    found = {
+        name: rows_at_ends(data.electrodes[data.sensor == number])
+        for number, name in enumerate(data.sensor_names)
+    }
+    return {name: rows for name, rows in found.items() if rows}
 
 
 def check_order(arrays: Mapping[str, Any], rows: npt.NDArray[np.int64], name: str) -> None:

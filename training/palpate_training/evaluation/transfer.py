@@ -21,16 +21,17 @@ from palpate.errors import DatasetError
 from palpate_training.datasets.container import refuse_repeated
 from palpate_training.datasets.features import (
     FeatureDataset,
+    at_an_end,
     check_learnable,
     of_sensor,
     period_of,
+    rows_at_ends,
 )
 from palpate_training.datasets.ingest import PRESS_N
 from palpate_training.learning.force_process import KnownRows
 from palpate_training.learning.metrics import force_errors
 from palpate_training.learning.splits import GUARD_S
 from palpate_training.learning.twin_line import TwinLine
-from palpate_training.systems.samples import at_an_end
 from palpate_training.systems.transfer import (
     ALIKE,
     LINE_VALIDATION,
@@ -71,11 +72,6 @@ class Finger:
     name: str
     recording: FingerRecording
     tared: npt.NDArray[np.float32]
-
-    def clipped(self) -> dict[str, int]:
-        """In how many rows each electrode that is ever at an end of its range is there."""
-        rows = at_an_end(self.recording.electrodes).sum(axis=0)
-        return {f"E{electrode + 1}": int(rows[electrode]) for electrode in np.flatnonzero(rows)}
 
 
 def fingers_of(data: FeatureDataset) -> list[Finger]:
@@ -250,7 +246,11 @@ def run_transfer(
         "twin": line is not None,
         "rows": len(test.recording.force),
         "tested_rows": min(len(tested) for _, tested in drawn),
-        "clipped": {one.name: rows for one in (*train, test) if (rows := one.clipped())},
+        "clipped": {
+            one.name: rows
+            for one in (*train, test)
+            if (rows := rows_at_ends(one.recording.electrodes))
+        },
         "impedance_ratio": ratio,
         "signal_ratio": float(model.signal_ratio(test.recording, whole=True)[-1]),
         "unlike": unlike,

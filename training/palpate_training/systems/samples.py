@@ -99,11 +99,6 @@ def impedance_ohm(counts: npt.NDArray[np.number]) -> npt.NDArray[np.float64]:
     return (COUNTS_MAX / inside - 1.0) * LOAD_OHM
 
 
-def at_an_end(counts: npt.NDArray[np.number]) -> npt.NDArray[np.bool_]:
-    """Where counts are at an end of their range and so tell no impedance; of the same shape."""
-    return np.asarray((counts <= 1) | (counts >= COUNTS_MAX - 1))
-
-
 def counts_at(ohm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """What electrodes with such an impedance [ohm] read, not rounded; undoes `impedance_ohm`."""
     return COUNTS_MAX / (1.0 + ohm / LOAD_OHM)

@@ -42,10 +42,11 @@ from scipy.signal import lfilter
 from scipy.special import xlogy
 
 from palpate.anatomy import ELECTRODE_MIRROR, ELECTRODE_POSITIONS
+from palpate_training.datasets.features import at_an_end
 from palpate_training.learning.baselines import AffineModel, ridge
 from palpate_training.learning.electrode_nets import MIRROR_AXES
 from palpate_training.learning.twin_line import TwinLine
-from palpate_training.systems.samples import at_an_end, counts_at, impedance_ohm
+from palpate_training.systems.samples import counts_at, impedance_ohm
 
 Floats = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.number]
