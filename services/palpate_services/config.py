@@ -7,7 +7,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
-from palpate.config import Name, RouterOptions, StrictConfig
+from palpate.bus.topics import TOPICS
+from palpate.config import Name, RouterOptions, StrictConfig, check_name
 from palpate.process import data_folder, state_folder
 from palpate.ros.rmw_zenoh import check_topic_name
 
@@ -189,6 +190,18 @@ class RecorderConfig(StrictConfig):
     keep_bytes: int = Field(default=20 * 1024**3, ge=0)
     keep_s: float = Field(default=14 * 86400.0, ge=0)
     drain_s: float = Field(default=1.5, ge=0, le=60)
+
+    @field_validator("topics")
+    @classmethod
+    def _known(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if unknown := sorted(set(value) - set(TOPICS)):
+            raise ValueError(f"unknown topic {unknown[0]!r}; known are {', '.join(TOPICS)}")
+        return value
+
+    @field_validator("sensor")
+    @classmethod
+    def _name_or_all(cls, value: str) -> str:
+        return value if value == "*" else check_name(value)
 
     @field_validator("rotate_bytes", "rotate_s")
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import json
 import os
@@ -257,6 +258,30 @@ def test_doctor_warns_where_the_disk_cannot_hold_what_is_kept(tmp_path: Path) ->
     assert "keep_bytes" in fix
     grade, _, _ = doctor._disk(changed(base, recorder={**keys, "keep_bytes": 0}))
     assert grade == "ok"
+
+
+def test_doctor_tells_a_folder_that_it_may_not_look_into(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shut = tmp_path / "shut"
+
+    def look(path: Path) -> bool:
+        if shut in path.parents:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return os.path.exists(path)
+
+    monkeypatch.setattr(Path, "exists", look)  # root may look everywhere
+    profile = tmp_path / "mine.toml"
+    profile.write_text(f'[recorder]\nout = "{shut}/runs"\n', "utf-8")
+    lines = {line.what: line for line in doctor._all(str(profile))}
+    assert lines["disk"].grade == "fail"
+    assert lines["disk"].found == f"{shut}/runs: Permission denied"
+
+
+def test_doctor_finds_no_room_in_a_file(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    profile = changed(load_profile("virtual"), recorder={"out": str(tmp_path / "file/runs")})
+    assert doctor._disk(profile)[:2] == ("fail", f"{tmp_path}/file is no folder")
 
 
 def test_doctor_warns_of_sensors_that_no_gateway_has() -> None:

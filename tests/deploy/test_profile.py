@@ -42,6 +42,7 @@ def test_the_four_profiles_ship() -> None:
         ('[[gateway.sensors]]\nnam = "x"', "'gateway.sensors.0.nam'", "'name'"),
         ('[link]\nzzz = "x"', "'link.zzz'", "known keys: certificates, connect"),
         ('[log]\nlevle = "info"', "'log.levle'", "'level'"),
+        ('_env_prefix = "X"', "'_env_prefix'", "known keys: features"),
     ],
 )
 def test_unknown_key_names_file_key_and_nearest(
@@ -58,6 +59,19 @@ def test_unknown_key_names_file_key_and_nearest(
 def test_wrong_type_names_key_value_and_what_was_expected(tmp_path: Path) -> None:
     path = _write(tmp_path, '[features]\ndrain_s = "soon"')
     with pytest.raises(ConfigError, match=r"features\.drain_s.*'soon'.*number"):
+        load_profile(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('topics = ["elektrodes"]', "unknown topic 'elektrodes'; known are .*electrodes"),
+        ('sensor = "No Such"', "'No Such' cannot stand in a Zenoh key"),
+    ],
+)
+def test_what_is_recorded_is_checked_with_the_profile(tmp_path: Path, text: str, says: str) -> None:
+    path = _write(tmp_path, f"[recorder]\n{text}")
+    with pytest.raises(ConfigError, match=says):
         load_profile(path)
 
 

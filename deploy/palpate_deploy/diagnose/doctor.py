@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import json
@@ -98,6 +99,9 @@ def _all(profile_name: str) -> Iterator[Finding]:
             yield Finding(what, *check(profile))
         except PalpateError as error:
             yield Finding(what, "fail", error.problem, error.remedy)
+        except OSError as error:  # e.g. a folder of somebody else, which may not be looked into
+            where = "" if error.filename is None else f"{error.filename}: "
+            yield Finding(what, "fail", f"{where}{error.strerror}", "correct it or its permissions")
 
 
 def _python() -> Finding:
@@ -262,6 +266,8 @@ def _disk(profile: Profile) -> Found:
         return "ok", "no recorder in this profile", ""
     folder = profile.recorder.out.absolute()
     existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not existing.is_dir():
+        return "fail", f"{existing} is no folder", "set [recorder] out to another folder"
     if not os.access(existing, os.W_OK):
         return "fail", f"{existing} is not writable", "set [recorder] out to another folder"
     free = shutil.disk_usage(existing).free
@@ -271,7 +277,10 @@ def _disk(profile: Profile) -> Found:
     if free < 10 * profile.recorder.min_free_bytes:
         return "warn", found, "free space soon"
     keeps = profile.recorder.keep_bytes
-    there = sum(path.stat().st_size for path in folder.glob(f"{profile.station}-*"))
+    there = 0
+    for path in folder.glob(f"{profile.station}-*"):
+        with contextlib.suppress(FileNotFoundError):  # the recorder has removed it meanwhile
+            there += path.stat().st_size
     if keeps > free + there - profile.recorder.min_free_bytes:
         return (
             "warn",

@@ -270,6 +270,10 @@ def parse_profile(values: Mapping[str, Any], *, where: str) -> Profile:
     """
     _check_environment()
     try:
+        # Keys such as `_env_file` would be arguments of BaseSettings itself.
+        Profile.model_validate(
+            {key: values[key] for key in set(values) - set(Profile.model_fields)}
+        )
         read = _FileAndEnvironment(**values)
     except ValidationError as error:
         blamed = _variable_of(error.errors()[0]["loc"])

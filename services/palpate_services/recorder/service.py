@@ -14,7 +14,7 @@ from palpate.bus import Delivery, Session, Tap
 from palpate.bus.tares import TareBook
 from palpate.bus.topics import TARE, TOPICS, Topic
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, RecordingError, StreamTimeout
+from palpate.errors import RecordingError, StreamTimeout
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
 from palpate.messages import ServiceState
@@ -53,7 +53,7 @@ def run_recorder(
         The records, in the order in which they were begun; one may not have been finished.
 
     Raises:
-        ConfigError: An unknown topic, or a bundle that does not exist.
+        ConfigError: A bundle that does not exist.
         LinkError: The bus cannot be joined.
         RecordingError: The folder of the records cannot be made.
     """
@@ -151,9 +151,4 @@ def _count_the_rest(tap: Tap, health: Health) -> None:
 
 
 def _topics(names: tuple[str, ...]) -> list[Topic[Any]]:
-    if unknown := sorted(set(names) - set(TOPICS)):
-        raise ConfigError(
-            f"recorder.topics names the unknown topic {unknown[0]!r}",
-            remedy=f"known topics: {', '.join(TOPICS)}",
-        )
     return [topic for name, topic in TOPICS.items() if (name in names if names else topic.recorded)]
