@@ -14,7 +14,7 @@ from palpate.bus import Delivery, Session, Tap
 from palpate.bus.tares import TareBook
 from palpate.bus.topics import TARE, TOPICS, Topic
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, RecordingError, StreamTimeout
+from palpate.errors import ConfigError, LinkError, RecordingError, StreamTimeout
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
 from palpate.messages import ServiceState
@@ -86,7 +86,8 @@ def run_recorder(
                 while _drain(tap, files, lambda: time.monotonic() < now_s + config.drain_s / 2):
                     time.sleep(_BATCH_S)
                 tap.close()
-                _drain(tap, files, lambda: write_all or time.monotonic() < until_s)
+                with contextlib.suppress(LinkError):  # it is closed, and nothing waits any more
+                    _drain(tap, files, lambda: write_all or time.monotonic() < until_s)
             finally:
                 tap.close()
                 _count_the_rest(tap, health)
@@ -141,7 +142,7 @@ def _drain(tap: Tap, files: RecordFiles, may_go_on: Callable[[], bool]) -> int:
 def _count_the_rest(tap: Tap, health: Health) -> None:
     """Count what a closed tap still holds: more than a stopping recorder had time to write."""
     left = 0
-    with contextlib.suppress(StreamTimeout):
+    with contextlib.suppress(LinkError):  # nothing waits any more
         while True:
             tap.next(0.0)
             left += 1
