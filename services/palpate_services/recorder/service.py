@@ -77,8 +77,7 @@ def run_recorder(
                 while not stop.wait(_BATCH_S):
                     _drain(tap, files, lambda: not stop.is_set())
                 presence.not_ready()
-                if health.state is not ServiceState.DEGRADED:
-                    health.set_state(ServiceState.STOPPING, "draining")
+                health.set_state(ServiceState.STOPPING, "draining")
                 now_s = time.monotonic()
                 until_s = now_s + config.drain_s
                 # Live streams go on and never let it run dry, so half of the time is kept for what
