@@ -280,7 +280,6 @@ def test_a_start_that_a_full_disk_refuses_is_no_run(
     monkeypatch: pytest.MonkeyPatch, refuses: str
 ) -> None:
     """It had a folder without a lock, and counted as one that runs while this process does."""
-
     call = os.open if refuses == "open" else fcntl.flock
 
     def refuse(on: Any, *rest: Any, **keys: Any) -> Any:
