@@ -133,7 +133,7 @@ class CommandGuard:
         # wall clock while it is set back by little: what was given before would be new again.
         self._began_ns = time.monotonic_ns()
         self._began_wall_ns = time.time_ns()
-        self._used: dict[bytes, int] = {}
+        self._used: dict[bytes, tuple[int, int]] = {}  # until when, by both clocks [ns]
         self._lock = threading.Lock()
 
     def admit(self, request: ModelRequest) -> ModelCommand:
@@ -174,11 +174,14 @@ class CommandGuard:
         return command
 
     def _use(self, nonce: bytes, now_ns: int) -> None:
+        steady_ns = time.monotonic_ns()
         with self._lock:
             if nonce in self._used:
                 _deny("the command was already obeyed", remedy="give a new command")
-            for old in [n for n, until_ns in self._used.items() if until_ns < now_ns]:
-                del self._used[old]
+            # By both: the wall clock may be set forward for a moment.
+            for old, (until_ns, until_steady_ns) in list(self._used.items()):
+                if until_ns < now_ns and until_steady_ns < steady_ns:
+                    del self._used[old]
             if len(self._used) >= _NONCES_MOST:
                 raise RemoteError(
                     f"{_NONCES_MOST} commands came within {2 * CLOCK_S:g} s",
@@ -187,7 +190,8 @@ class CommandGuard:
                     retry_after_s=CLOCK_S,
                 )
             # It could pass once more until its time is over on the latest clock that is accepted.
-            self._used[nonce] = now_ns + round(2 * CLOCK_S * 1e9)
+            holds_ns = round(2 * CLOCK_S * 1e9)
+            self._used[nonce] = now_ns + holds_ns, steady_ns + holds_ns
 
 
 def _deny(problem: str, *, remedy: str = _REMEDY) -> NoReturn:

@@ -172,7 +172,7 @@ class Health:
                 _log.warning("gauge %s = %s measures nothing and is left out", name, value)
 
     def fail(self, error: PalpateError, *, degraded: bool = True) -> None:
-        """Remember the last error; by default the state becomes DEGRADED.
+        """Remember the last error; by default the state becomes DEGRADED, unless it is STOPPING.
 
         One that does not degrade is not shown before the state is no longer DEGRADED by another.
         """
@@ -181,7 +181,7 @@ class Health:
             new = told != self._last_error
             self._last_error = told
             self._message = error.problem
-            if degraded:
+            if degraded and self._state is not ServiceState.STOPPING:
                 self._state_error, self._state_message = told, error.problem
                 new = new or self._state is not ServiceState.DEGRADED
                 self._state, self._recovery = ServiceState.DEGRADED, None

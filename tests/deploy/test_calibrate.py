@@ -235,7 +235,11 @@ def test_nothing_is_pressed_before_the_recorder_records(
 
 
 def recording_of(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, *names: str, fails: bool = False
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *names: str,
+    fails: bool = False,
+    stops: bool = True,
 ) -> guided_presses._Recording:
     """A recording that has ended, whose recorder wrote these files, and failed at the end."""
 
@@ -243,6 +247,8 @@ def recording_of(
         config.out.mkdir(parents=True)
         for name in names:
             (config.out / name).touch()
+        if stops:
+            health.set_state(ServiceState.STOPPING)
         if fails:
             health.fail(RecordingError("the disk is full", remedy="free some space"))
 
@@ -252,11 +258,12 @@ def recording_of(
     return recording
 
 
+@pytest.mark.parametrize("stops", [False, True])
 def test_a_recorder_that_pauses_ends_the_presses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stops: bool
 ) -> None:
     """What is pressed while it pauses is lost."""
-    recording = recording_of(tmp_path, monkeypatch, "lab-1.mcap", fails=True)
+    recording = recording_of(tmp_path, monkeypatch, "lab-1.mcap", fails=True, stops=stops)
     for look in (recording.check, recording.path):
         with pytest.raises(RecordingError, match="the disk is full") as told:
             look()

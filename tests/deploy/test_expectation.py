@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,6 +27,7 @@ from palpate_deploy.station.host import (
     KEPT_RUNS,
     RUN_LOCK,
     RunDiskError,
+    end_run,
     free_endpoint,
     new_run_folder,
     private_profile,
@@ -269,6 +273,37 @@ def test_a_full_disk_is_no_forbidden_folder(
     monkeypatch.setattr(Path, "mkdir", refuse)
     with pytest.raises(refusal, match="XDG_STATE_HOME"):
         new_run_folder("lab")
+
+
+@pytest.mark.parametrize("refuses", ["open", "flock"])
+def test_a_start_that_a_full_disk_refuses_is_no_run(
+    monkeypatch: pytest.MonkeyPatch, refuses: str
+) -> None:
+    """It had a folder without a lock, and counted as one that runs while this process does."""
+    call = os.open if refuses == "open" else fcntl.flock
+
+    def refuse(on: Any, *rest: Any, **keys: Any) -> Any:
+        if refuses == "flock" or Path(on).name == RUN_LOCK:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return call(on, *rest, **keys)
+
+    with monkeypatch.context() as full:
+        full.setattr(os if refuses == "open" else fcntl, refuses, refuse)
+        with pytest.raises(RunDiskError):
+            new_run_folder("lab")
+    assert running_folders() == []
+    assert list((state_folder() / "runs").iterdir()) == []
+
+
+def test_a_start_that_is_refused_leaves_the_run_whose_name_it_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(time, "strftime", lambda _: "20260101-000000")
+    running = new_run_folder("lab")
+    with pytest.raises(ConfigError, match="File exists"):
+        new_run_folder("lab")
+    assert running_folders() == [running]
+    end_run(running)
 
 
 def test_a_run_of_an_older_palpate_is_told_by_its_process() -> None:

@@ -11,7 +11,9 @@ import pytest
 from tests.gateway.pose_fakes import BENCH, frame
 from tests.gateway.ros_fakes import BEGAN_NS, all_fields, wrench_fields
 
-from palpate.config import parse_config
+from palpate.bus import Session
+from palpate.bus.foreign import ForeignSample
+from palpate.config import LinkConfig, parse_config
 from palpate.errors import DeviceLost, StreamTimeout
 from palpate.messages import Pose
 from palpate.ros.layouts import BIOTAC_ALL, WRENCH_STAMPED, encode
@@ -159,4 +161,18 @@ def test_messages_before_another_publisher_are_delivered(monkeypatch: pytest.Mon
     )
     assert [one.message for one in topic.take(0.1)] == [b"0", b"1", b"2"]
     with pytest.raises(DeviceLost, match="another publisher"):
+        topic.take(0.1)
+
+
+def test_messages_before_the_session_is_closed_are_delivered() -> None:
+    """Once it is, the topic is lost and not only silent: nothing will come."""
+    topic: RosSubscription[bytes] = RosSubscription(
+        parse_config(RosTopicOptions, TOPIC, where="test"), "", bytes
+    )
+    with Session.open(LinkConfig(connect=())) as session:
+        topic._subscriber = subscriber = session.foreign_subscriber("rt/x")
+        attachment = SampleInfo(1, 1, bytes(16)).encode()
+        subscriber._waiting.put("rt/x", ForeignSample("rt/x", b"0", attachment, 1))
+    assert [one.message for one in topic.take(0.1)] == [b"0"]
+    with pytest.raises(DeviceLost, match="closed"):
         topic.take(0.1)

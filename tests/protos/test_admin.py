@@ -137,6 +137,19 @@ def test_a_clock_that_is_set_back_a_little_after_a_start_makes_no_old_command_ne
     assert again.admit(signed(command(), TOKEN)).bundle == "x:1"
 
 
+def test_a_clock_that_is_set_forward_and_back_makes_no_obeyed_command_new(
+    guard: CommandGuard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another command meanwhile made it forget the number of the first."""
+    true_ns = time.time_ns
+    request = signed(command(), TOKEN)
+    guard.admit(request)
+    with monkeypatch.context() as ahead:
+        ahead.setattr(time, "time_ns", lambda: true_ns() + 120 * 10**9)
+        guard.admit(signed(command(), TOKEN))
+    assert "already obeyed" in denied(guard, request)
+
+
 def test_numbers_are_kept_while_they_could_pass_and_no_more(
     guard: CommandGuard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,8 +160,9 @@ def test_numbers_are_kept_while_they_could_pass_and_no_more(
         guard.admit(signed(command(), TOKEN))
     assert caught.value.code is ErrorCode.RESOURCE_EXHAUSTED
     assert caught.value.retry_after_s > 0
-    later_ns = time.time_ns() + 61 * 10**9
+    later_ns, steady_ns = (now() + 61 * 10**9 for now in (time.time_ns, time.monotonic_ns))
     monkeypatch.setattr(time, "time_ns", lambda: later_ns)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: steady_ns)
     guard.admit(signed(command(wall_ns=later_ns), TOKEN))
     assert len(guard._used) == 1
 

@@ -17,7 +17,7 @@ import pytest
 
 from palpate import clock
 from palpate.bus import SensorClaims, Session, run_router
-from palpate.bus.claims import YIELD_S
+from palpate.bus.claims import SETTLE_S, YIELD_S
 from palpate.bus.topics import CLAIM_ROOT, SensorClaim, claim_key
 from palpate.config import LinkConfig
 from palpate.errors import ClaimedElsewhere, SensorTaken
@@ -244,10 +244,17 @@ def test_of_two_that_could_not_see_each_other_the_older_holds(
             assert claims.refusal("finger") is None
 
 
+@pytest.mark.parametrize("flooded", ["s{}", "thumb"], ids=["not-wanted", "wanted"])
 def test_a_flood_of_claims_is_bounded_and_hides_no_holder(
-    link: LinkConfig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    link: LinkConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    flooded: str,
 ) -> None:
-    """They were all kept, and looked through many times a second with the lock."""
+    """They were all kept, and looked through many times a second with the lock.
+
+    And one sensor was held by two gateways, if the flood was on another that the second wanted.
+    """
     most, flood = 20, 60
     monkeypatch.setattr("palpate.bus.claims.MOST_CLAIMS", most)
 
@@ -259,7 +266,7 @@ def test_a_flood_of_claims_is_bounded_and_hides_no_holder(
 
     with Session.open(link) as invents, ExitStack() as stack:
         for number in range(flood):  # each comes before the holder of the finger
-            claim = SensorClaim("lab", f"s{number}", 1000 + number, True, 1)
+            claim = SensorClaim("lab", flooded.format(number), 1000 + number, True, 1)
             invents.foreign_token(claim_key(claim))
         first = stack.enter_context(claims_of(link, 2**62))
         assert held_within_patience(first)
@@ -269,9 +276,11 @@ def test_a_flood_of_claims_is_bounded_and_hides_no_holder(
         other = session.claims(session_id=1, instance="other", lease_s=LEASE_S)
         wait_until_ignored(flood + 1 - most)
         assert not any(one.sensor == "finger" for one in other._others.values())
+        other.want("thumb")
         other.want("finger")
         assert f"session {2**62:016x}" in str(refusal_of(other))
-        assert not other.wait("finger", 0.0)
+        assert not other.wait("finger", 5 * SETTLE_S)
+        assert other.refusal("finger") is not None
         assert len(other._others) <= most
         first.check("finger")
 

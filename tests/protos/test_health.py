@@ -105,12 +105,22 @@ def test_stopping_waits_for_nothing(clock: Time) -> None:
     assert health.state is ServiceState.STOPPING
 
 
-def test_what_stops_is_not_ready_again() -> None:
-    """A command that ends meanwhile says what serves."""
+@pytest.mark.parametrize("fails", [False, True])
+def test_what_stops_is_not_ready_again(clock: Time, fails: bool) -> None:
+    """A command that ends meanwhile says what serves, or a disk takes records again."""
     health = Health("features", "features")
     health.set_state(ServiceState.STOPPING, "draining")
+    if fails:
+        health.changed.clear()
+        health.fail(SILENT)
+        assert health.changed.is_set()
+        error = health.status().last_error
+        assert error is not None
+        assert error.message == SILENT.problem
     health.set_state(ServiceState.READY, "serves force 3")
-    assert (health.state, health.status().message) == (ServiceState.STOPPING, "draining")
+    clock.now_s += health_module.RECOVERY_S + 1e-6
+    told = SILENT.problem if fails else "draining"
+    assert (health.state, health.status().message) == (ServiceState.STOPPING, told)
 
 
 def test_a_lost_sensor_is_live_when_it_has_delivered_for_a_while(clock: Time) -> None:

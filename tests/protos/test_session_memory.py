@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from palpate.bus import Session, endpoints
+from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.link import _close_all
+from palpate.bus.tares import TareBook
 from palpate.bus.topics import ELECTRODES, FEATURES
 from palpate.client import Client
 from palpate.config import LinkConfig
@@ -29,6 +30,7 @@ MADE: dict[str, Callable[[Session], Any]] = {
     "publisher": lambda session: session.publisher(ELECTRODES, sensor="finger"),
     "subscriber": lambda session: session.subscriber(FEATURES, sensor="finger"),
     "tap": lambda session: session.tap([FEATURES]),
+    "newest tap": lambda session: session.tap([FEATURES], delivery=Delivery.NEWEST),
     "queryable": lambda session: session.queryable(endpoints.TARE, no_tare, sensor="finger"),
     "claims": lambda session: session.claims(instance="one", lease_s=2.0),
     "presence": lambda session: session.presence("features", instance="one"),
@@ -60,6 +62,25 @@ def test_what_is_open_is_closed_with_its_session(what: str) -> None:
     with Session.open(LinkConfig(connect=())) as session:
         made, other = MADE[what](session), MADE["publisher"](session)
     assert (made.closed, other.closed) == (True, True)
+
+
+@pytest.mark.parametrize("what", ["subscriber", "tap", "newest tap", "foreign subscriber"])
+def test_who_takes_messages_of_a_closed_session_is_told(what: str) -> None:
+    """Told at once that none came in time, a loop that tries again span."""
+    with Session.open(LinkConfig(connect=())) as session:
+        stream = MADE[what](session)
+        with pytest.raises(StreamTimeout):
+            stream.next(0.01)
+    with pytest.raises(LinkError, match="closed -> open the session again"):
+        stream.next(0.01)
+
+
+def test_a_tare_that_is_not_known_is_refused_by_a_closed_session() -> None:
+    with Session.open(LinkConfig(connect=())) as session:
+        book = TareBook(session)
+        assert book.find("finger", 7) is None
+    with pytest.raises(LinkError, match="closed -> open the session again"):
+        book.find("finger", 7)
 
 
 def test_questions_to_what_was_closed_still_count(

@@ -324,5 +324,5 @@ def test_a_tap_is_emptied_after_it_was_closed(
     tap.close()
     for _ in range(2):
         assert tap.next(0.0).sensor == "finger"
-    with pytest.raises(StreamTimeout):
+    with pytest.raises(LinkError, match="electrodes is closed"):
         tap.next(0.0)

@@ -21,6 +21,7 @@ from palpate.config import LinkConfig
 from palpate.errors import ErrorCode, StreamTimeout
 from palpate.files.record import read_record
 from palpate.files.record_writer import RecordWriter
+from palpate.health import Health
 from palpate.messages import (
     ElectrodeFrame,
     Origin,
@@ -190,6 +191,25 @@ def test_full_disk_is_reported_and_inference_does_not_notice(
             frames.put(make_frame(sequence))
             assert answers.next(5.0).message.source.sequence == sequence
     assert list(tmp_path.glob("*.mcap*")) == []
+
+
+def test_a_recorder_that_waits_for_room_says_that_it_stops(
+    link: LinkConfig, until: Until, tmp_path: Path
+) -> None:
+    stop, health = threading.Event(), Health("recorder", "recorder")
+    config = RecorderConfig(out=tmp_path, rrd=False, min_free_bytes=10**17)
+    node = threading.Thread(
+        target=run_recorder, args=(config, link, "lab", stop), kwargs={"health": health}
+    )
+    node.start()
+    until(lambda: health.state is ServiceState.DEGRADED)
+    stop.set()
+    node.join(timeout=30)
+    assert not node.is_alive()
+    status = health.status()
+    assert status.state is ServiceState.STOPPING
+    assert status.last_error is not None
+    assert status.last_error.code is ErrorCode.DISK
 
 
 def test_disk_that_fills_up_while_recording(

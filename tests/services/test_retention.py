@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
 from palpate.bus.topics import ELECTRODES, sensor_key
 from palpate.errors import ConfigError
+from palpate.files.bounded import open_regular
 from palpate.files.record_writer import RecordWriter
 from palpate.health import Health
 from palpate_services.config import EVERYTHING, RecorderConfig
@@ -109,24 +112,73 @@ def test_nothing_else_is_ever_removed(tmp_path: Path) -> None:
     assert health.counters.get("removed_records", 0) == 0
 
 
-def test_a_record_that_cannot_be_read_for_a_moment_is_looked_at_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def refuse(*_: object) -> NoReturn:
+    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+
+@pytest.mark.parametrize("cut_off", [False, True])
+def test_a_record_that_cannot_be_read_for_a_moment_is_as_old_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cut_off: bool
 ) -> None:
-    """It counted as somebody else's until the recorder was started again, and the disk filled."""
+    """It counted as just closed, and newer ones were removed in its place."""
     old = record(tmp_path, name_of(1), age_s=50.0)
+    if cut_off:
+        old = old.rename(old.with_name(f"{old.name}.part"))
     record(tmp_path, name_of(2))
     kept, health = keeper(tmp_path, keep_bytes=150_000)
+    opens: dict[str, Callable[..., Any]] = {
+        "palpate.files.record.open_regular": open_regular,
+        "builtins.open": open,
+    }
 
-    def refuse(path: Path) -> None:
-        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+    def refuse_old(at: str) -> Callable[..., Any]:
+        return lambda path, *rest: refuse() if path == old else opens[at](path, *rest)
 
     with monkeypatch.context() as many_open:
-        many_open.setattr("palpate.files.record.open_regular", refuse)
+        for at in opens:
+            many_open.setattr(at, refuse_old(at))
         kept.apply()
-    assert old.exists()
+    assert left(tmp_path) == [old.name, name_of(2)]
     kept.apply()
     assert left(tmp_path) == [name_of(2)]
     assert health.counters["removed_records"] == 1
+
+
+def test_a_folder_that_cannot_be_read_for_a_moment_is_looked_at_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ended the recorder."""
+    record(tmp_path, name_of(1), age_s=50.0)
+    record(tmp_path, name_of(2))
+    kept, _ = keeper(tmp_path, keep_bytes=150_000)
+    with monkeypatch.context() as many_open:
+        many_open.setattr(os, "listdir", refuse)
+        many_open.setattr(os, "scandir", refuse)
+        kept.apply()
+    kept.apply()
+    assert left(tmp_path) == [name_of(2)]
+
+
+def test_a_record_that_was_open_at_the_first_look_ends_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cut off later, by a clock that is years behind at its last write."""
+    clocks = [1000.0, time.time()]
+    monkeypatch.setattr(Retention, "_read_clocks", staticmethod(lambda: (clocks[0], clocks[1])))
+    part = record(tmp_path, name_of(1), age_s=400 * DAY_S)
+    part = part.rename(part.with_name(f"{part.name}.part"))
+    kept, _ = keeper(tmp_path, keep_s=DAY_S)
+    with open(part, "rb") as writer:
+        fcntl.flock(writer, fcntl.LOCK_EX)
+        kept.apply()
+    for at in (0, 1):
+        clocks[at] += retention.STEADY_S
+    kept.apply()
+    assert left(tmp_path) == [part.name]
+    for at in (0, 1):
+        clocks[at] += 1.1 * DAY_S
+    kept.apply()
+    assert left(tmp_path) == []
 
 
 def test_what_was_cut_off_and_recovered_counts_too(tmp_path: Path) -> None:

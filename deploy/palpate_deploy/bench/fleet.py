@@ -188,11 +188,11 @@ def measure_scale(stations: int, seconds: float) -> dict[str, Any]:
                 ),
             }
             if watching is not None:
-                stop_child(watching, _STOP_S)
-                phases[topic] |= _latency(out, stations)
-        stop_child(floor_consumer, _STOP_S)
+                end_ns = _stop_consumer(watching)
+                phases[topic] |= _latency(out, stations, end_ns)
+        end_ns = _stop_consumer(floor_consumer)
         # Of the last phase alone, beside which it stands.
-        direct_s = _latency(direct, 1, since_ns=round(1e9 * began_s))
+        direct_s = _latency(direct, 1, end_ns, since_ns=round(1e9 * began_s))
         return {
             "stations": stations,
             "phases": phases,
@@ -202,11 +202,18 @@ def measure_scale(stations: int, seconds: float) -> dict[str, Any]:
         }
 
 
-def _latency(out: Path, stations: int, *, since_ns: int = 0) -> dict[str, Any]:
+def _stop_consumer(process: subprocess.Popen[bytes]) -> int:
+    """Stop a consumer, which then writes what it took; until when it did [ns, monotonic]."""
+    end_ns = time.monotonic_ns()
+    stop_child(process, _STOP_S)
+    return end_ns
+
+
+def _latency(out: Path, stations: int, end_ns: int, *, since_ns: int = 0) -> dict[str, Any]:
     """Latency of what a consumer took, and what was lost since its first message.
 
-    A station that fell silent before the others has lost what it would have sent. Messages that
-    came before ``since_ns`` [ns], host monotonic clock, are left out.
+    A station that fell silent before ``end_ns`` has lost what it would have sent. Messages that
+    came before ``since_ns`` are left out; both [ns], host monotonic clock.
     """
     names, rows, _ = read_rows(out)
     names, rows = names[rows[:, 2] >= since_ns], rows[rows[:, 2] >= since_ns]
@@ -217,7 +224,7 @@ def _latency(out: Path, stations: int, *, since_ns: int = 0) -> dict[str, Any]:
     for station in set(names.tolist()):
         own = rows[names == station, 0]
         lost += int(own.max() - own.min() + 1 - len(set(own.tolist())))
-        lost += owed(np.sort(rows[names == station, 2]), int(rows[:, 2].max()))
+        lost += owed(np.sort(rows[names == station, 2]), end_ns)
     p50, p99 = np.percentile(ages_s, (50, 99))
     return {
         "p50_s": float(p50),
@@ -250,8 +257,8 @@ def measure_impaired(seconds: float) -> list[dict[str, Any]]:
                 found.append({"netem": " ".join(words), "not_measured": why})
                 continue
             time.sleep(seconds)
-            stop_child(watching, _STOP_S)
-            found.append({"netem": " ".join(words) or "none", **_latency(out, 1)})
+            end_ns = _stop_consumer(watching)
+            found.append({"netem": " ".join(words) or "none", **_latency(out, 1, end_ns)})
     return found
 
 

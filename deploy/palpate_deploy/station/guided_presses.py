@@ -226,9 +226,10 @@ class _Recording:
         """Raise what ended it, or what it loses messages by: nobody shall press for nothing."""
         if self.failure is not None:
             raise self.failure
-        if self.health.state is ServiceState.DEGRADED:
-            error = self.health.status().last_error
-            assert error is not None, "it says why"
+        status = self.health.status()
+        error = status.last_error
+        # One that stops is not DEGRADED, whatever happens then.
+        if error is not None and status.state is not ServiceState.READY:
             raise RecordingError(
                 error.message,
                 remedy=f"{error.remedy}; {self._out} keeps what was recorded, for --from",

@@ -139,6 +139,7 @@ def new_run_folder(name: str) -> Path:
     runs = state_folder() / "runs"
     stamp = time.strftime("%Y%m%d-%H%M%S")
     folder = runs / f"{stamp}-{name}-{os.getpid()}"
+    lock = -1
     try:
         (folder / "logs").mkdir(parents=True, mode=0o700)
         # The kernel gives the lock back when this process ends, however it does.
@@ -146,6 +147,11 @@ def new_run_folder(name: str) -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)
         _locks[folder] = lock
     except OSError as error:
+        if lock >= 0:
+            os.close(lock)
+        # Without a lock it would count as a run for as long as this process runs.
+        if not isinstance(error, FileExistsError):  # that one is another run's
+            shutil.rmtree(folder, ignore_errors=True)
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise _no_room(folder, error) from error
         raise ConfigError(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import logging
 import os
 import random
 import select
@@ -25,6 +26,8 @@ from palpate_gateway.emulators.emulator import Emulator
 
 BUS_ERROR, BUS_OFF, RESTARTED = 0x080, 0x040, 0x100
 """Classes of CAN error frames: bits of the identifier (linux/can/error.h)."""
+
+_log = logging.getLogger(__name__)
 
 _AT_ONCE = 4096
 _TERMINALS = "/dev/pts/"
@@ -56,7 +59,8 @@ def reserve(path: str | Path) -> socket.socket:
     """Reserve the name of a line, until the socket that is returned is closed.
 
     Whoever ends loses its reservations, so that the name which a killed emulator left can be used
-    again, and that of a running one cannot.
+    again, and that of a running one cannot. A link that leads to a pseudo terminal counts as one
+    that a killed emulator left, whoever made it.
 
     Raises:
         ConfigError: An emulator that runs has the name, or something else than a line is there.
@@ -100,6 +104,7 @@ class SerialLine:
         self._folder = ""
         self._device = self._host = -1
         self._reserved: socket.socket | None = None
+        self._told = False
         self._noise = random.Random(baud)
 
     @property
@@ -111,7 +116,8 @@ class SerialLine:
         """Make the line, or do nothing if it is there.
 
         Raises:
-            ConfigError: Its name cannot be had, see ``reserve``.
+            ConfigError: Its name cannot be had, see ``reserve``; or something else took the name of
+                a line that was unplugged.
         """
         if self.plugged:
             return
@@ -120,15 +126,24 @@ class SerialLine:
             self.path = str(Path(self._folder) / "tty")
         if self._reserved is None:
             self._reserved = reserve(self.path)
-        self._device, self._host = os.openpty()
+            if Path(self.path).is_symlink():
+                Path(self.path).unlink()
+        device, host = os.openpty()
         # The host's end stays open here as well, or its settings would be lost and reads would
         # fail.
-        tty.setraw(self._device)
-        tty.setraw(self._host)
-        os.set_blocking(self._device, False)
-        if Path(self.path).is_symlink():
-            Path(self.path).unlink()
-        Path(self.path).symlink_to(os.ttyname(self._host))
+        tty.setraw(device)
+        tty.setraw(host)
+        os.set_blocking(device, False)
+        try:
+            Path(self.path).symlink_to(os.ttyname(host))
+        except OSError as error:
+            os.close(device)
+            os.close(host)
+            raise ConfigError(
+                f"{self.path} cannot be made: {error.strerror or error}",
+                remedy="move what is there, or choose another name",
+            ) from error
+        self._device, self._host = device, host
 
     def unplug(self) -> None:
         """Remove the line, as if its adapter were pulled; the name stays reserved."""
@@ -141,11 +156,20 @@ class SerialLine:
             self._device = self._host = -1
 
     def keep_plugged(self, plugged: bool) -> None:
-        """Plug or unplug the line, if it is not in this state yet."""
-        if plugged:
-            self.plug()
-        else:
+        """Plug or unplug the line, if it is not in this state yet.
+
+        It stays unplugged, which is logged once, while its name cannot be had.
+        """
+        if not plugged:
             self.unplug()
+            return
+        try:
+            self.plug()
+            self._told = False
+        except ConfigError as error:
+            if not self._told:
+                _log.warning("%s", error)
+            self._told = True
 
     def close(self) -> None:
         """Unplug for good."""

@@ -198,7 +198,8 @@ class RosSubscription(Generic[T]):
 
         Raises:
             DeviceTimeout: None came in time.
-            DeviceLost: The publisher was started again, or another has taken its place.
+            DeviceLost: The publisher was started again, another has taken its place, or the session
+                was closed.
         """
         assert self._subscriber is not None
         if self._end is not None:
@@ -212,6 +213,8 @@ class RosSubscription(Generic[T]):
                     f"no new message on {self._options.topic} within {timeout_s:g} s",
                     remedy="check that its driver runs: ros2 topic hz",
                 ) from error
+            except LinkError as error:
+                raise DeviceLost(error.problem, remedy=error.remedy) from error
             info = self._info(sample.attachment)
             lost = self._lost(info)
             if lost is not None and lost < 0:

@@ -241,14 +241,25 @@ class SensorClaims(Declared):
             self._changed.notify_all()
 
     def _remember(self, key: str, claim: SensorClaim) -> None:
-        """With the lock. Of too many those are ignored that are least likely to come first."""
+        """With the lock. Of too many those are ignored that are least likely to come first.
+
+        Never the one that comes first of those on a wanted sensor, however many are on others.
+        """
         self._others[key] = claim
         if len(self._others) > MOST_CLAIMS:
+            first: dict[str, SensorClaim] = {}
+            for one in self._others.values():
+                own = self._own.get(one.sensor)
+                if own is not None and self._excludes(one, own.claim):
+                    first[one.sensor] = min(
+                        first.get(one.sensor, one), one, key=lambda of: of.order
+                    )
             last = max(
                 self._others,
-                key=lambda one: (
-                    self._others[one].sensor not in self._own,
-                    self._others[one].order,
+                key=lambda key: (
+                    (one := self._others[key]).sensor not in self._own,
+                    first.get(one.sensor) is not one,
+                    one.order,
                 ),
             )
             del self._others[last]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import zenoh
 
 from palpate.bus.delivery import FifoQueue
-from palpate.bus.ring import is_wake, undeclare
+from palpate.bus.ring import is_wake, subscription_closed, undeclare
 from palpate.bus.zenoh_session import Declared
 from palpate.errors import LinkError, StreamTimeout
 
@@ -41,6 +41,7 @@ class ForeignSubscriber(Declared):
     """Samples of a key expression, first in, first out. Made by ``Session.foreign_subscriber``."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._key = key
         self._counters: Counter[str] = Counter()
         self._waiting: FifoQueue[ForeignSample] = FifoQueue(
             self._counters, _WAITING_MOST, sender_waits=False
@@ -72,8 +73,11 @@ class ForeignSubscriber(Declared):
 
         Raises:
             StreamTimeout: None came within ``timeout_s``.
+            LinkError: None is left, and this or the session is closed.
         """
         item = self._waiting.get(max(timeout_s, 0.0))
+        if item is None and self.closed:
+            raise subscription_closed(self._key)
         if item is None:
             raise StreamTimeout(
                 f"no sample within {timeout_s:g} s", remedy="check that its program runs"

@@ -11,7 +11,7 @@ import zenoh
 
 from palpate import clock
 from palpate.bus.delivery import Delivery, DeliveryQueue, queue_for
-from palpate.bus.ring import is_wake, undeclare
+from palpate.bus.ring import is_wake, subscription_closed, undeclare
 from palpate.bus.topics import parse_key
 from palpate.bus.zenoh_session import Declared
 from palpate.errors import StreamTimeout, WireError
@@ -49,6 +49,7 @@ class Tap(Declared):
         delivery: Delivery,
         capacity: int,
     ) -> None:
+        self._keys = ", ".join(keys)
         self._counters: Counter[str] = Counter()
         self._waiting: DeliveryQueue[tuple[zenoh.Sample, int, int]] = queue_for(
             delivery, capacity, self._counters
@@ -76,14 +77,17 @@ class Tap(Declared):
         return len(self._waiting)
 
     def next(self, timeout_s: float) -> TapSample:
-        """The next sample.
+        """The next sample; those that wait in a queue are there after ``close``, too.
 
         Raises:
             StreamTimeout: None came within ``timeout_s``.
+            LinkError: None is left, and the tap or its session is closed.
         """
         deadline = time.monotonic() + timeout_s
         while True:
             item = self._waiting.get(max(0.0, deadline - time.monotonic()))
+            if item is None and self.closed:
+                raise subscription_closed(self._keys)
             if item is None:
                 raise StreamTimeout(
                     f"no message within {timeout_s:g} s", remedy="check what runs: palpate status"

@@ -61,6 +61,9 @@ class TareBook:
         """The tare that a frame names by its id, which is not ``NO_TARE``; never waits.
 
         None: it is not known yet, and is being asked for.
+
+        Raises:
+            LinkError: It is not known, and the session is closed.
         """
         tare = self._known.get((sensor, tare_id))
         if tare is None:
@@ -83,7 +86,7 @@ class TareBook:
                 answer: in a replay a frame can arrive before its tare.
 
         Raises:
-            LinkError: It is not known here and no gateway answers.
+            LinkError: It is not known here and no gateway answers, or the session is closed.
             StreamTimeout: The gateway does not answer in time.
             RemoteError: The gateway does not know it either.
         """

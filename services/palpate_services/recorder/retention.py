@@ -11,7 +11,7 @@ import contextlib
 import logging
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,8 +64,9 @@ class Retention:
         self._name = re.compile(f"(?P<stem>{re.escape(station)}{_STAMP}){_ENDING}")
         self._health = health
         self._mine: dict[tuple[str, int], bool] = {}  # by name and inode: files never change
-        # Those closed since the first look, and when (steady, s): the wall clock by which their
-        # files were written may have been put right since then.
+        # Those that were closed at the first look; and when each other one was first seen closed
+        # (steady, s): the wall clock by which it was written may have been put right since then.
+        self._earlier: set[tuple[str, int]] = set()
         self._closed_s: dict[tuple[str, int], float] = {}
         self._looked = False
         self._clocks = self._read_clocks()
@@ -81,7 +82,12 @@ class Retention:
         """Remove what is too old or too much; ``present_bytes`` is the size of the open record."""
         if not self.facts:
             return
-        records = self._records()
+        try:
+            paths = list(self._config.out.iterdir())
+        except OSError as error:
+            _log.warning("%s cannot be read: %s", self._config.out, error.strerror or error)
+            return
+        records = sorted(self._found(paths), key=lambda record: (record.ended_s, record.path.name))
         total = sum(record.size for record in records) + present_bytes
         oldest_s = self._oldest_allowed_s()
         for record in records:
@@ -109,14 +115,11 @@ class Retention:
     def _read_clocks() -> tuple[float, float]:
         return time.clock_gettime(_STEADY), time.time()
 
-    def _records(self) -> list[OldRecord]:
-        """Closed records that this station's recorder may remove, oldest first."""
-        return sorted(self._found(), key=lambda record: (record.ended_s, record.path.name))
-
-    def _found(self) -> Iterator[OldRecord]:
+    def _found(self, paths: Iterable[Path]) -> Iterator[OldRecord]:
+        """Closed records among these that this station's recorder may remove."""
         seen: set[tuple[str, int]] = set()
         steady_s, wall_s = self._read_clocks()
-        for path in self._config.out.glob(f"{self._station}-*.mcap*"):
+        for path in paths:
             match = self._name.fullmatch(path.name)
             # A file can be renamed, recovered or removed by others at any time.
             with contextlib.suppress(OSError, RecordingError):
@@ -124,13 +127,17 @@ class Retention:
                     continue
                 status = path.stat()
                 key = path.name, status.st_ino
+                seen.add(key)
+                # Before it is opened, which may fail for a moment: its age does not depend on that.
+                if not self._looked:
+                    self._earlier.add(key)
                 if path.suffix == ".part" and is_being_written(path):
+                    self._earlier.discard(key)
                     continue
+                if key not in self._earlier:
+                    self._closed_s.setdefault(key, steady_s)
                 if key not in self._mine:
                     self._mine[key] = metadata_of(path).get(FACT) == OLDEST_FIRST
-                    if self._looked:
-                        self._closed_s[key] = steady_s
-                seen.add(key)
                 if not self._mine[key]:
                     continue
                 view = path.with_name(f"{match['stem']}.rrd")
@@ -138,6 +145,7 @@ class Retention:
                 closed_s = self._closed_s.get(key)
                 ended_s = status.st_mtime if closed_s is None else wall_s - (steady_s - closed_s)
                 yield OldRecord(path, view, size, ended_s)
+        self._earlier &= seen
         self._mine = {key: mine for key, mine in self._mine.items() if key in seen}
         self._closed_s = {key: at_s for key, at_s in self._closed_s.items() if key in seen}
         self._looked = True

@@ -14,7 +14,7 @@ from palpate.bus import Delivery, Session, Tap
 from palpate.bus.tares import TareBook
 from palpate.bus.topics import TARE, TOPICS, Topic
 from palpate.config import LinkConfig
-from palpate.errors import RecordingError, StreamTimeout
+from palpate.errors import LinkError, RecordingError, StreamTimeout
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
 from palpate.messages import ServiceState
@@ -77,8 +77,7 @@ def run_recorder(
                 while not stop.wait(_BATCH_S):
                     _drain(tap, files, lambda: not stop.is_set())
                 presence.not_ready()
-                if health.state is not ServiceState.DEGRADED:
-                    health.set_state(ServiceState.STOPPING, "draining")
+                health.set_state(ServiceState.STOPPING, "draining")
                 now_s = time.monotonic()
                 until_s = now_s + config.drain_s
                 # Live streams go on and never let it run dry, so half of the time is kept for what
@@ -86,7 +85,8 @@ def run_recorder(
                 while _drain(tap, files, lambda: time.monotonic() < now_s + config.drain_s / 2):
                     time.sleep(_BATCH_S)
                 tap.close()
-                _drain(tap, files, lambda: write_all or time.monotonic() < until_s)
+                with contextlib.suppress(LinkError):  # it is closed, and nothing waits any more
+                    _drain(tap, files, lambda: write_all or time.monotonic() < until_s)
             finally:
                 tap.close()
                 _count_the_rest(tap, health)
@@ -141,7 +141,7 @@ def _drain(tap: Tap, files: RecordFiles, may_go_on: Callable[[], bool]) -> int:
 def _count_the_rest(tap: Tap, health: Health) -> None:
     """Count what a closed tap still holds: more than a stopping recorder had time to write."""
     left = 0
-    with contextlib.suppress(StreamTimeout):
+    with contextlib.suppress(LinkError):  # nothing waits any more
         while True:
             tap.next(0.0)
             left += 1

@@ -86,6 +86,29 @@ def test_what_replaced_the_line_is_not_removed_with_it(
     assert name.readlink() == tmp_path
 
 
+@pytest.mark.parametrize("kind", ["link", "file"])
+def test_what_took_the_name_of_an_unplugged_line_stays(
+    line: SerialLine, name: Path, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A link was replaced by the line, and removed at its end; a file ended the emulator."""
+    line.unplug()
+    if kind == "link":
+        name.symlink_to("/dev/ttyUSB0")
+    else:
+        name.write_text("mine")
+    for _ in range(3):
+        line.keep_plugged(True)
+        assert not line.plugged
+        assert line.read(0.0) == b""
+    assert caplog.text.count(f"{name} cannot be made: File exists") == 1
+    assert name.is_symlink() == (kind == "link")
+    name.unlink()
+    line.keep_plugged(True)
+    assert name.readlink().is_char_device()
+    line.close()
+    assert not name.is_symlink()
+
+
 def test_a_line_tells_whether_all_can_be_read(line: SerialLine) -> None:
     assert line.write(b"heard")
     while line.write(bytes(1000)):
