@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from palpate.bus import TapSample
-from palpate.bus.topics import ELECTRODES
+from palpate.bus.topics import ELECTRODES, Topic
 from palpate.config import LinkConfig
 from palpate.files.record import read_record
 from palpate_deploy.diagnose import topics
@@ -21,6 +22,7 @@ def test_what_it_could_not_take_itself_is_no_loss_of_the_stream(
         for item in read_record(virtual_record)
         if item.address.topic == ELECTRODES.name
     }
+    electrodes: Topic[Any] = ELECTRODES
     rate = topics.StreamRate()
     for sequence, lost_here in ((11, 0), (13, 0), (16, 2), (17, 2)):
         item = frames[sequence]
@@ -36,10 +38,10 @@ def test_what_it_could_not_take_itself_is_no_loss_of_the_stream(
             arrived_ns,
             lost_here,
         )
-        rate.add(ELECTRODES, sample)
+        rate.add(electrodes, sample)
     numbers = rate.summary()
     assert (numbers["lost"], numbers["overflow"]) == (1, 2)
-    topics.print_rates(ELECTRODES, {"finger": rate})
+    topics.print_rates(electrodes, {"finger": rate})
     assert "lost 1  overflow 2" in capsys.readouterr().out
 
 
