@@ -51,8 +51,9 @@ class GatewayConfig(StrictConfig):
             and its baseline has drifted [s]; None = never. A press that comes slowly and then stays
             looks like drift: docs/tare-and-health.md.
         retare_drift_counts: Drift of an electrode that causes this [counts].
-        pace: Recordings at their own pace (stamped with the present time) or as fast as possible
-            (stamps as recorded, nothing is ever dropped).
+        pace: Recordings at their own pace (stamped with the present time; messages of a palpate
+            record keep their stamps) or as fast as possible (stamps as recorded, nothing is ever
+            dropped).
         wait_for: Services that must be ready before a fast recording starts.
         exit_at_end: End the process when every source has ended; of a fast recording, when all
             services have read it.

@@ -126,7 +126,8 @@ class RecordedMessage:
     Attributes:
         topic: Stream name, e.g. ``"electrodes"``.
         payload: The encoded message as it was recorded.
-        time_s: When it was recorded [s since the Unix epoch].
+        time_s: When it was recorded, by a wall clock that was not set meanwhile [s since the Unix
+            epoch].
     """
 
     topic: str

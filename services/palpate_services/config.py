@@ -173,6 +173,8 @@ class RecorderConfig(StrictConfig):
         keep_s: Records are removed when they are older than this [s]; 0 = never.
         drain_s: How long a stopping recorder still writes messages that have arrived [s]; a
             lossless replay needs longer than a live station.
+        run: Stands in the metadata of its records, as ``run``: tells them from others in their
+            folder; empty = nothing stands there.
     """
 
     out: Path = Path("runs")
@@ -190,6 +192,7 @@ class RecorderConfig(StrictConfig):
     keep_bytes: int = Field(default=20 * 1024**3, ge=0)
     keep_s: float = Field(default=14 * 86400.0, ge=0)
     drain_s: float = Field(default=1.5, ge=0, le=60)
+    run: str = ""
 
     @field_validator("topics")
     @classmethod

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import gzip
 import json
+import os
+import shutil
 import subprocess
 import time
 from collections import Counter
@@ -79,6 +81,35 @@ def test_slow_answers_do_not_make_a_replay_lossy(
     account = replay(profile, text_log)
     assert account.problems == []
     assert account.published == account.recorded["electrodes"] == 118
+
+
+def test_records_of_others_in_its_folder_are_not_its_own(
+    text_log: Path,
+    virtual_record: Path,
+    bundle: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its recorder recovers what a killed one has left, and another one may end meanwhile."""
+    out = tmp_path / "out"
+    out.mkdir()
+    left = out / "replay-20200101T000000.000Z.mcap.part"
+    left.write_bytes(virtual_record.read_bytes()[:-8000])
+    os.utime(left, (0, 0))
+    other = out / "replay-20200102T000000.000Z.mcap"
+
+    def meanwhile(session: Session) -> list[Status]:
+        shutil.copy(virtual_record, other)
+        return ask_status(session)
+
+    monkeypatch.setattr("palpate_deploy.diagnose.replay.ask_status", meanwhile)
+    profile = replay_profile(text_log, "fast", out, "features-virtual", rrd=False)
+    account = replay(profile, text_log)
+    recovered = out / "replay-20200101T000000.000Z.recovered.mcap"
+    assert set(out.glob("*.mcap")) == {other, recovered, *account.records}
+    assert len(account.records) == 1
+    assert account.problems == []
+    assert account.recorded["electrodes"] == 118
 
 
 def test_record_of_a_virtual_finger(

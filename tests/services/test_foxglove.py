@@ -138,6 +138,47 @@ def test_a_lost_electrode_is_not_shown_as_pressed(
     assert max(colours[4]) < min(max(colour) for at, colour in enumerate(colours) if at != 4)
 
 
+def log_times_of(path: Path) -> dict[str, list[int]]:
+    """Topic -> times at which a player shows its messages [ns]."""
+    found: dict[str, list[int]] = {}
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            found.setdefault(channel.topic, []).append(message.log_time)
+    return found
+
+
+def test_a_scene_comes_with_its_message_in_a_replay_too(record: Path, tmp_path: Path) -> None:
+    """There the stamps are of the first run, and the log of the second."""
+    again, later_ns = tmp_path / "again.mcap", 3600 * 10**9
+    arrivals_ns: dict[str, set[int]] = {}
+    with RecordWriter(again) as writer:
+        for item in read_record(record):
+            time_ns = item.log_time_ns + later_ns
+            arrivals_ns.setdefault(item.address.sensor, set()).add(time_ns)
+            writer.write(item.key, item.schema, item.payload, log_time_ns=time_ns)
+    export_foxglove(again, tmp_path / "f.mcap")
+    times_ns = log_times_of(tmp_path / "f.mcap")
+    for sensor, arrived_ns in arrivals_ns.items():
+        assert set(times_ns[f"/{sensor}/scene"]) == arrived_ns
+        assert times_ns["/tf"][0] <= min(arrived_ns)
+
+
+def test_electrodes_are_coloured_after_the_clock_was_set_back(
+    make_frame: Frames, make_tare: Callable[..., Tare], tmp_path: Path
+) -> None:
+    path, frame = tmp_path / "lab.mcap", make_frame(tare_id=5)
+    with RecordWriter(path) as writer:
+        codec, key = TOPICS["tare"].codec, sensor_key("lab", "left", "tare")
+        writer.write(key, codec.schema, codec.encode(make_tare()), log_time_ns=1)
+        codec, key = TOPICS["electrodes"].codec, sensor_key("lab", "left", "electrodes")
+        for number, set_back_s in enumerate((0, 0, 60, 60)):
+            wall_ns = frame.stamp.wall_ns + (number - 10 * set_back_s) * 10**8
+            stamp = dataclasses.replace(frame.stamp, sequence=number + 1, wall_ns=wall_ns)
+            payload = codec.encode(dataclasses.replace(frame, stamp=stamp))
+            writer.write(key, codec.schema, payload, log_time_ns=wall_ns)
+    assert export_foxglove(path, tmp_path / "f.mcap")["/left/scene"] == 4
+
+
 def test_what_is_no_longer_there_is_deleted(record: Path, tmp_path: Path) -> None:
     export_foxglove(record, tmp_path / "f.mcap")
     scenes = messages_of(tmp_path / "f.mcap")["/right/scene"]

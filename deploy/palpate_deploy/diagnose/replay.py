@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import secrets
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from rich.table import Table
 from palpate.bus import Delivery, Session, Subscriber
 from palpate.bus.topics import ELECTRODES, FEATURES, STATUS
 from palpate.errors import LinkError, PalpateError, RecordingError, printable
-from palpate.files.record import summarise
+from palpate.files.record import metadata_of, summarise
 from palpate.messages import SensorState, ServiceState, Status
 from palpate_deploy.diagnose.records import viewer_command
 from palpate_deploy.station.host import join, private_profile
@@ -264,7 +265,12 @@ def replay_profile(file: Path, pace: str, out: Path, bundle: str, *, rrd: bool) 
         gateway={"pace": pace, "sensors": sensors, "linger_s": _LINGER_S},
         link={"lease_s": _LEASE_S},
         features={"bundle": bundle, "delivery": delivery, "accept_replayed": True},
-        recorder={"out": str(out), "delivery": "every" if fast else "queue", "rrd": rrd},
+        recorder={
+            "out": str(out),
+            "delivery": "every" if fast else "queue",
+            "rrd": rrd,
+            "run": secrets.token_hex(8),
+        },
     )
 
 
@@ -350,7 +356,10 @@ def replay(profile: Profile, file: Path, *, show: bool = False) -> ReplayAccount
             task = bar.add_task(file.name, total=None, frames=0)
             account.exit_status = _follow(children, session, account, bar, task)
     account.seconds = time.monotonic() - began
-    account.records = sorted(set(out.glob("*.mcap")) - before)
+    # Meanwhile its recorder may have recovered an older one there, and another have closed its own.
+    fresh = set(out.glob(f"{profile.station}-*.mcap")) - before
+    run = profile.recorder.run
+    account.records = sorted(path for path in fresh if metadata_of(path).get("run", "") == run)
     account.recorded = count_topics(account.records)
     if account.exit_status != 0:
         account.error = children.ended("gateway", account.exit_status)

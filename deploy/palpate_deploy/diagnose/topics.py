@@ -207,13 +207,15 @@ class StreamRate:
     """Rate and losses of one source.
 
     ``bytes`` is the size of the payloads, ``rejected`` counts those that do not decode; ``lost``
-    are gaps in the sequence numbers of contiguous streams, ``missed`` the frames that the device
-    itself lost, by ``missed_before``; ``gaps_s`` are times between two arrivals [s].
+    are gaps in the sequence numbers of contiguous streams, ``overflow`` messages that came faster
+    than they were counted here, and ``missed`` the frames that the device itself lost, by
+    ``missed_before``; ``gaps_s`` are times between two arrivals [s].
     """
 
     messages: int = 0
     bytes: int = 0
     lost: int = 0
+    overflow: int = 0
     rejected: int = 0
     missed: int = 0
     gaps_s: list[float] = field(default_factory=list)
@@ -227,6 +229,7 @@ class StreamRate:
         if self._arrival_ns:
             self.gaps_s.append((sample.received_monotonic_ns - self._arrival_ns) * 1e-9)
         self._arrival_ns = sample.received_monotonic_ns
+        self.overflow = sample.lost_here
         try:
             stamp = topic.stamp_of(topic.codec.decode(sample.payload))
         except WireError:
@@ -236,7 +239,9 @@ class StreamRate:
             return
         if topic.contiguous:
             arrived_ns = sample.received_monotonic_ns
-            self.lost += self._holes.take(sample.key, stamp, arrived_ns=arrived_ns)
+            self.lost += self._holes.take(
+                sample.key, stamp, arrived_ns=arrived_ns, lost_here=sample.lost_here
+            )
         self.missed += stamp.missed_before
 
     def summary(self) -> dict[str, float | int | None]:
@@ -251,6 +256,7 @@ class StreamRate:
             "std_s": statistics.pstdev(self.gaps_s) if some else None,
             "bytes_per_s": self.bytes / total_s if some else None,
             "lost": self.lost,
+            "overflow": self.overflow,
             "missed_by_device": self.missed,
             "rejected": self.rejected,
         }
@@ -279,10 +285,13 @@ def measure(
     ):
         end = time.monotonic() + seconds if seconds else float("inf")
         report = time.monotonic() + _REPORT_S
+        told = False  # that nothing came
         try:
             while (now := time.monotonic()) < end:
                 if now >= report and not as_json:
-                    print_rates(topic, rates)
+                    if rates or not told:
+                        print_rates(topic, rates)
+                    told = True
                     report = now + _REPORT_S
                 try:
                     sample = tap.next(max(0.0, min(end, report) - now))
@@ -295,7 +304,7 @@ def measure(
     if as_json:
         found = {source: rate.summary() for source, rate in sorted(rates.items())}
         print(json.dumps({"topic": name, "sources": found}, indent=2))
-    else:
+    elif rates or not told:
         print_rates(topic, rates)
     return 0 if rates else FAILED
 
@@ -314,8 +323,8 @@ def print_rates(topic: Topic[object], rates: dict[str, StreamRate]) -> None:
             f"{source}: {numbers['rate_hz']:.2f} Hz  "
             f"min {_ms(numbers['min_s'])}  max {_ms(numbers['max_s'])}  "
             f"std {_ms(numbers['std_s'])}  {(numbers['bytes_per_s'] or 0) / 1e3:.1f} kB/s  "
-            f"lost {rate.lost}  missed by device {rate.missed}  rejected {rate.rejected}  "
-            f"n {rate.messages}",
+            f"lost {rate.lost}  overflow {rate.overflow}  missed by device {rate.missed}  "
+            f"rejected {rate.rejected}  n {rate.messages}",
             flush=True,
         )
 

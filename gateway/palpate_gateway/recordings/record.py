@@ -19,6 +19,7 @@ from palpate.files.record import RecordItem, only_name, read_record
 from palpate.messages import ElectrodeFrame, SensorType
 from palpate_gateway.device import DeviceIdentity, FileDevice
 from palpate_gateway.readings import RecordedMessage
+from palpate_gateway.recordings.pace import RecordPace
 
 _REPLAYED = frozenset(topic.name for topic in (ELECTRODES, WRENCH, POSE, FIELD_TRUTH, TARE))
 
@@ -75,12 +76,14 @@ class RecordReplay(FileDevice):
         )
 
     def _messages(self, slots: int) -> Iterator[RecordedMessage]:
+        pace = RecordPace(self._options.path, self._sensor)
         for item in read_record(self._options.path):
             if item.address.sensor == self._sensor and item.address.topic in _REPLAYED:
                 self._counters["messages"] += 1
                 if _is_electrodes(item):
                     self._counters["samples"] += slots
-                yield RecordedMessage(item.address.topic, item.payload, item.log_time_ns * 1e-9)
+                time_s = 1e-9 * pace.time_ns(item)
+                yield RecordedMessage(item.address.topic, item.payload, time_s)
 
     def _first_frame(self) -> ElectrodeFrame:
         """The first one that can be decoded."""

@@ -405,6 +405,8 @@ class RecordFiles:
             self._check_room(self._config.min_free_bytes)
             path = self._new_path()
             facts = {"station": self._station, **self._retention.facts}
+            if self._config.run:
+                facts["run"] = self._config.run
             self._writer = RecordWriter(path, facts)
         except RecordingError as error:
             self._fail(error.problem)

@@ -135,7 +135,10 @@ class _Scenes:
         self._electrodes_ns: dict[str, int] = {}
 
     def add(self, sensor: str, message: Any, log_time_ns: int) -> None:
-        """Take a message of a finger, and write what it changes."""
+        """Take a message of a finger, and write what it changes at the time it was logged.
+
+        A player shows a file by these times; in a replayed record the stamps are older ones.
+        """
         finger = self._fingers.get(sensor)
         if finger is None:
             finger = self._fingers[sensor] = SensorTimeline()
@@ -145,19 +148,20 @@ class _Scenes:
             return
         rows = finger.take()
         for row in rows["electrodes/tared"]:
-            if row.time_ns - self._electrodes_ns.get(sensor, 0) >= ELECTRODE_PERIOD_NS:
+            # The wall clock may have been set back.
+            if abs(row.time_ns - self._electrodes_ns.get(sensor, 0)) >= ELECTRODE_PERIOD_NS:
                 self._electrodes_ns[sensor] = row.time_ns
                 places = ELECTRODE_PLACES[finger.sensor_type]
-                self._scene(sensor, row.time_ns, _electrodes(sensor, row, places))
+                self._scene(sensor, log_time_ns, _electrodes(sensor, row, places))
         for name in _COLOURS:
             for row in rows[f"arrow/{name}"]:
-                self._scene(sensor, row.time_ns, _arrow(sensor, name, row))
+                self._scene(sensor, log_time_ns, _arrow(sensor, name, row))
             for row in rows[f"location/{name}"]:
-                self._scene(sensor, row.time_ns, _contact(sensor, name, row))
+                self._scene(sensor, log_time_ns, _contact(sensor, name, row))
             for field in rows[f"field/{name}"]:
-                self._field(sensor, name, field)
+                self._field(sensor, name, field, log_time_ns)
 
-    def _field(self, sensor: str, name: str, field: FieldRow) -> None:
+    def _field(self, sensor: str, name: str, field: FieldRow, log_time_ns: int) -> None:
         mesh = self._meshes.find(field.mesh_sha256)
         if mesh is None or field.displacement.shape != mesh.nodes.shape:
             self.counts["view_no_mesh" if mesh is None else "view_wrong_mesh"] += 1
@@ -174,21 +178,21 @@ class _Scenes:
         for colour in _colours(shades(np.linalg.norm(moved, axis=1) / FIELD_FULL_M)):
             _paint(triangles.colors.add(), colour)
         triangles.indices.extend(skin.triangles.reshape(-1).tolist())
-        self._scene(sensor, field.time_ns, entity)
+        self._scene(sensor, log_time_ns, entity)
 
-    def _scene(self, sensor: str, time_ns: int, change: Any) -> None:
+    def _scene(self, sensor: str, log_time_ns: int, change: Any) -> None:
         """Write an entity, or that one is there no more."""
         from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
         from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
         update = SceneUpdate()
         (update.entities if isinstance(change, SceneEntity) else update.deletions).append(change)
-        self._write(f"/{sensor}/scene", update, time_ns)
+        self._write(f"/{sensor}/scene", update, log_time_ns)
 
-    def _write(self, topic: str, message: Any, time_ns: int) -> None:
+    def _write(self, topic: str, message: Any, log_time_ns: int) -> None:
         channel = self._channels.channel(topic, type(message))
         data = message.SerializeToString()
-        self._writer.add_message(channel, log_time=time_ns, data=data, publish_time=time_ns)
+        self._writer.add_message(channel, log_time_ns, data, publish_time=log_time_ns)
         self.counts[topic] += 1
 
 

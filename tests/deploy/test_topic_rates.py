@@ -1,0 +1,58 @@
+"""``palpate topic hz``: what it counts, and what it says of a stream that is silent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.bus import TapSample
+from palpate.bus.topics import ELECTRODES, Topic
+from palpate.config import LinkConfig
+from palpate.files.record import read_record
+from palpate_deploy.diagnose import topics
+
+
+def test_what_it_could_not_take_itself_is_no_loss_of_the_stream(
+    virtual_record: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = {
+        item.sequence: item
+        for item in read_record(virtual_record)
+        if item.address.topic == ELECTRODES.name
+    }
+    electrodes: Topic[Any] = ELECTRODES
+    rate = topics.StreamRate()
+    for sequence, lost_here in ((11, 0), (13, 0), (16, 2), (17, 2)):
+        item = frames[sequence]
+        arrived_ns = sequence * 10**7
+        sample = TapSample(
+            ELECTRODES.name,
+            item.address.station,
+            item.address.sensor,
+            item.key,
+            ELECTRODES.encoding,
+            item.payload,
+            arrived_ns,
+            arrived_ns,
+            lost_here,
+        )
+        rate.add(electrodes, sample)
+    numbers = rate.summary()
+    assert (numbers["lost"], numbers["overflow"]) == (1, 2)
+    topics.print_rates(electrodes, {"finger": rate})
+    assert "lost 1  overflow 2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("report_s", [0.05, 60.0])
+def test_that_nothing_came_is_said_once(
+    link: LinkConfig,
+    report_s: float,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(topics, "_REPORT_S", report_s)
+    assert topics.measure(link, "lab", "electrodes", "*", 0.5, as_json=False) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["no electrodes came; see what runs: palpate status"]
