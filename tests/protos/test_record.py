@@ -22,7 +22,7 @@ from mcap.reader import make_reader
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, sensor_key
 from palpate.codec import ELECTRODE_FRAME, WRENCH_FRAME
 from palpate.errors import RecordingError, WireError
-from palpate.files.record import check_readable, read_record, recover, summarise
+from palpate.files.record import check_readable, only_name, read_record, recover, summarise
 from palpate.files.record_writer import RecordWriter, descriptor_set
 from palpate.messages import Stamp
 
