@@ -45,6 +45,16 @@ def test_info_table(palpate: Palpate, virtual_record: Path) -> None:
     assert "wall clock" not in result.stdout
 
 
+@pytest.mark.parametrize("as_json", [False, True])
+def test_info_refuses_a_damaged_index(virtual_record: Path, tmp_path: Path, as_json: bool) -> None:
+    path = tmp_path / "spoilt.mcap"
+    content = bytearray(virtual_record.read_bytes())
+    content[-100] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"spoilt\.mcap: the checksum of its index"):
+        records.show_info(path, as_json=as_json)
+
+
 def test_info_says_that_the_wall_clock_was_set(
     virtual_record: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

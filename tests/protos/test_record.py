@@ -22,7 +22,7 @@ from mcap.reader import make_reader
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, sensor_key
 from palpate.codec import ELECTRODE_FRAME, WRENCH_FRAME
 from palpate.errors import RecordingError, WireError
-from palpate.files.record import check_readable, read_record, recover, summarise
+from palpate.files.record import check_readable, only_name, read_record, recover, summarise
 from palpate.files.record_writer import RecordWriter, descriptor_set
 from palpate.messages import Stamp
 
@@ -221,16 +221,21 @@ def long_record(tmp_path: Path, payload: bytes) -> Path:
     return path
 
 
+def chunks_of(record: Path) -> list[int]:
+    """Where the chunks begin."""
+    with record.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return [index.chunk_start_offset for index in summary.chunk_indexes]
+
+
 @pytest.mark.parametrize("where", ["within a chunk", "over heads of records", "first chunk"])
 @pytest.mark.parametrize("ending", [".mcap", ".mcap.part"])
 def test_what_lies_behind_a_damage_is_recovered_and_nothing_is_deleted(
     long_record: Path, where: str, ending: str
 ) -> None:
     whole = long_record.read_bytes()
-    with long_record.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    chunks = [index.chunk_start_offset for index in summary.chunk_indexes]
+    chunks = chunks_of(long_record)
     assert len(chunks) == 30
     begin, size = {
         "within a chunk": (chunks[10] + 80, 3),
@@ -261,6 +266,39 @@ def test_what_lies_behind_a_damage_is_recovered_and_nothing_is_deleted(
     assert kept.read_bytes() == content
 
 
+@pytest.mark.parametrize("bit", range(8))
+def test_a_chunk_that_says_it_is_something_else_is_missed_and_saved(
+    long_record: Path, bit: int
+) -> None:
+    """One flipped bit of its first byte; readers pass over kinds of records they do not know."""
+    content = bytearray(long_record.read_bytes())
+    chunks = chunks_of(long_record)
+    content[chunks[10]] ^= 1 << bit
+    long_record.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"run\.mcap is damaged.*palpate recover"):
+        summarise(long_record)
+    part = long_record.with_name("cut.mcap.part")
+    part.write_bytes(content[: chunks[20]])
+    for damaged, messages in ((long_record, 300), (part, 200)):
+        found = recover(damaged)
+        assert [item.sequence for item in read_record(found.path)] == list(range(messages))
+        assert (found.places, found.left_out) == (1, 1)
+        assert found.original is not None
+
+
+def test_every_flipped_bit_of_the_index_is_noticed(long_record: Path) -> None:
+    """Others seek by it: those would miss messages, or fail."""
+    content = long_record.read_bytes()
+    begin = int.from_bytes(content[-28:-20], "little")  # by the footer
+    for bit in range(8 * begin, 8 * len(content), 101):
+        changed = bytearray(content)
+        changed[bit >> 3] ^= 1 << (bit & 7)
+        long_record.write_bytes(changed)
+        with pytest.raises(RecordingError, match=r"run\.mcap: .*recover it"):
+            check_readable(long_record)
+    recover(long_record)
+
+
 def test_a_stream_is_saved_whose_schema_stood_in_a_damaged_chunk(
     tmp_path: Path, payload: bytes
 ) -> None:
@@ -271,10 +309,7 @@ def test_a_stream_is_saved_whose_schema_stood_in_a_damaged_chunk(
             writer.write(key, ELECTRODE_FRAME.schema, payload, log_time_ns=1000)
             writer.flush()
     whole = bytearray(path.read_bytes())
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    first = summary.chunk_indexes[0].chunk_start_offset
+    first = chunks_of(path)[0]
     whole[first + 80 : first + 83] = bytes(3)
     path.write_bytes(whole)
     assert summarise(recover(path).path).counts == {thumb: 1}
@@ -328,6 +363,30 @@ def test_flipped_bits_never_raise_anything_but_recording_errors(
         damaged.write_bytes(changed)
         with contextlib.suppress(RecordingError):
             assert len(list(read_record(damaged))) == 20  # e.g. a bit of an unused index
+
+
+def test_a_second_station_is_refused_by_name_but_counted_and_recovered(
+    tmp_path: Path, payload: bytes
+) -> None:
+    """Else two fingers of one name become one; such files come of ``mcap merge``."""
+    path = tmp_path / "two.mcap"
+    keys = [KEY, sensor_key("other", "finger", "electrodes")]
+    with RecordWriter(path) as writer:
+        for number in range(20):
+            writer.write(
+                keys[number % 2], ELECTRODE_FRAME.schema, payload, log_time_ns=1000 + number
+            )
+    refusal = r"two\.mcap holds the stations lab, other -> .*@v1/other/"
+    with pytest.raises(RecordingError, match=refusal):
+        list(read_record(path))
+    with pytest.raises(RecordingError, match=refusal):
+        only_name(path, "electrodes", "sensor")
+    assert summarise(path).counts == dict.fromkeys(keys, 10)
+    with pytest.raises(RecordingError, match="is whole"):
+        recover(path)
+    part = tmp_path / "cut.mcap.part"
+    part.write_bytes(path.read_bytes()[:-100])
+    assert summarise(recover(part).path).counts == dict.fromkeys(keys, 10)
 
 
 def test_a_foreign_or_empty_file_is_refused(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ import pytest
 
 from palpate import heartbeat
 from palpate.bus import TapSample
-from palpate.bus.topics import ELECTRODES, TARE, sensor_key
+from palpate.bus.topics import ELECTRODES, TARE, Topic, sensor_key
 from palpate.codec import ELECTRODE_FRAME
 from palpate.errors import ErrorCode, RecordingError
 from palpate.files import record_writer
@@ -35,14 +35,14 @@ Frames = Callable[..., ElectrodeFrame]
 Until = Callable[[Callable[[], bool]], None]
 
 
-def sample_of(payload: bytes, sensor: str = "finger") -> TapSample:
-    key = sensor_key("lab", sensor, "electrodes")
+def sample_of(payload: bytes, sensor: str = "finger", topic: Topic[Any] = ELECTRODES) -> TapSample:
+    key = sensor_key("lab", sensor, topic.name)
     return TapSample(
-        "electrodes",
+        topic.name,
         "lab",
         sensor,
         key,
-        ELECTRODES.encoding,
+        topic.encoding,
         payload,
         time.monotonic_ns(),
         time.time_ns(),
@@ -121,6 +121,22 @@ def test_each_record_holds_the_tares_that_its_frames_name(
     assert ("finger", NO_TARE) not in asked
     assert health.counters["recorded_electrodes"] == 1499
     assert health.counters["recorded_tare"] == len(records)
+
+
+def test_each_record_holds_a_tare_once(
+    open_files: Any, make_frame: Frames, make_tare: Callable[..., Tare], tmp_path: Path
+) -> None:
+    """It was looked up for a frame that overtook it, and a gateway tells it again."""
+    tares = [sample_of(TARE.codec.encode(make_tare(k)), topic=TARE) for k in (5, 5, 6, 5)]
+    with open_files(lambda _, tare_id: make_tare(tare_id)) as (files, health):
+        files.write(sample_of(ELECTRODE_FRAME.encode(make_frame(1, tare_id=5))))
+        for tare in tares:
+            files.write(tare)
+    (record,) = (tmp_path / "runs").iterdir()
+    kinds = [item.address.topic for item in read_record(record)]
+    assert kinds == ["tare", "electrodes", "tare"]
+    assert health.counters["recorded_tare"] == 2
+    assert health.counters["repeated_tares"] == 3
 
 
 def test_what_never_came_is_counted_once(

@@ -29,9 +29,11 @@ from palpate.messages import (
     ServiceState,
     Status,
     Tare,
+    TareRequest,
 )
 from palpate_services.config import FeaturesServiceConfig, RecorderConfig
 from palpate_services.inference.services import run_estimating
+from palpate_services.recorder import service
 from palpate_services.recorder.service import run_recorder
 from palpate_services.recorder.writer import RecordFiles, leftovers, recover_all
 
@@ -256,6 +258,52 @@ def test_disk_that_fills_up_while_recording(
         until(lambda: any(runs.glob("*.recovered.mcap")))
     kept = payloads(disk / "runs", "electrodes")
     assert len(kept) >= 40
+
+
+def test_frames_of_a_running_station_come_after_their_tare(
+    link: LinkConfig,
+    make_frame: Frames,
+    make_tare: Callable[..., Tare],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Frames are heard before the gateway has answered which tare it is that they name."""
+    monkeypatch.setattr(service, "_TARES_WAIT_S", 60.0)
+    health = Health("recorder", "recorder")
+    config = RecorderConfig(out=tmp_path, rrd=False, min_free_bytes=0)
+    stop = threading.Event()
+    recorder = threading.Thread(
+        target=run_recorder, args=(config, link, "lab", stop), kwargs={"health": health}
+    )
+    with Session.open(link) as session:
+        frames = session.publisher(ELECTRODES, sensor="finger")
+        sent = 0
+
+        def send() -> None:
+            nonlocal sent
+            frames.put(make_frame(sent := sent + 1))
+            time.sleep(0.01)
+
+        def answer(_: TareRequest) -> Tare:
+            time.sleep(0.3)
+            return make_tare()
+
+        session.queryable(endpoints.TARE, answer, sensor="finger")
+        recorder.start()
+        try:
+            end_s = time.monotonic() + 60.0
+            while health.counters.get("recorded_electrodes", 0) < 100:
+                assert time.monotonic() < end_s, health.counters
+                send()
+        finally:
+            stop.set()
+            recorder.join(timeout=15)
+    (record,) = tmp_path.glob("*.mcap")
+    kinds = [(i.address.topic, i.sequence) for i in read_record(record)]
+    own = [kind for kind in kinds if kind[0] in ("tare", "electrodes")]
+    first = own[1][1]
+    assert own[0][0] == "tare"
+    assert own[1:] == [("electrodes", first + k) for k in range(len(own) - 1)]
 
 
 KILLED = """

@@ -132,7 +132,7 @@ def show_info(path: Path, *, as_json: bool) -> None:
     if not as_json:
         print_contents(path)
         return
-    summary = summarise(path)
+    summary = _summary(path)
     print(
         json.dumps(
             {
@@ -153,15 +153,21 @@ def show_info(path: Path, *, as_json: bool) -> None:
     )
 
 
+def _summary(path: Path) -> RecordSummary:
+    """Contents of a record; of a finished one its index is checked, too."""
+    summary = summarise(path)
+    if summary.complete:
+        check_readable(path)
+    return summary
+
+
 def print_contents(path: Path) -> RecordSummary:
     """Print one row for each stream of a record.
 
     Raises:
         RecordingError: It is damaged or not palpate's.
     """
-    summary = summarise(path)
-    if summary.complete:
-        check_readable(path)
+    summary = _summary(path)
     began = datetime.fromtimestamp(summary.start_wall_ns * 1e-9, UTC)
     table = Table(title=cell(str(path)), title_justify="left")
     table.add_column("stream", overflow="fold")

@@ -40,7 +40,7 @@ def recorded_sensors(path: Path) -> list[str]:
     """Names of the sensors whose electrodes are in a record.
 
     Raises:
-        RecordingError: The file is not a record, or it is damaged.
+        RecordingError: The file is not a record, is damaged, or holds several stations.
     """
     found = {item.address.sensor for item in read_record(path) if _is_electrodes(item)}
     return sorted(found)

@@ -57,6 +57,7 @@ _TIME_MAX_NS = 2**63  # the year 2262; later ones do not fit the arrays of times
 _END_BYTES = _HEAD.size + 20 + len(_MAGIC)  # footer and magic
 _PASSED_OVER_MAX = CHUNK_BYTES_MAX  # of one record, where a file is known to be damaged [bytes]
 _PACKED_CHUNK = re.compile(rb"\x06.{36}(?:\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4)", re.DOTALL)
+_CHUNK_HEAD_BYTES = _HEAD.size + 28 + 8  # as far as the expression looks
 _LOOK_FIRST, _LOOK_BYTES = 1 << 12, 1 << 20
 _LOOK_MAX = 1 << 30  # how far the next chunk behind a damage is looked for [bytes]
 
@@ -113,7 +114,8 @@ def parts_of(file: IO[bytes], on_damage: OnDamage | None = None) -> Iterator[Par
 
     Raises:
         NoMcapError: It is no MCAP file.
-        ValueError: It exceeds a bound or, without ``on_damage``, is damaged.
+        ValueError: It exceeds a bound or, without ``on_damage``, is damaged or holds another number
+            of messages or chunks than its statistics say.
         EOFError: The end is missing.
     """
     budget = _Budget(os.fstat(file.fileno()).st_size)
@@ -124,6 +126,8 @@ def parts_of(file: IO[bytes], on_damage: OnDamage | None = None) -> Iterator[Par
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise EOFError("the end is missing")
             return
+        if opcode == Opcode.STATISTICS and on_damage is None:
+            budget.compare(Statistics.read(ReadDataStream(BytesIO(data))))
         try:
             yield from _parts(opcode, data, at, budget)
         except DAMAGED as error:
@@ -134,6 +138,7 @@ def parts_of(file: IO[bytes], on_damage: OnDamage | None = None) -> Iterator[Par
 
 def _parts(opcode: int, data: bytes, at: int, budget: _Budget) -> Iterator[Part]:
     if opcode == Opcode.CHUNK:
+        budget.chunks += 1
         yield from _of_chunk(_chunk(data, at), at, budget)
     elif opcode == Opcode.METADATA:
         yield Metadata.read(ReadDataStream(BytesIO(data)))
@@ -144,6 +149,7 @@ def _parts(opcode: int, data: bytes, at: int, budget: _Budget) -> Iterator[Part]
 def _part(opcode: int, data: bytes, at: int, budget: _Budget) -> Part | None:
     """A record of a kind that stands in chunks, too; None = of another kind."""
     if opcode == Opcode.MESSAGE:
+        budget.messages += 1
         budget.spend(_MESSAGE_COST, at)
         return _message(data, at)
     if opcode == Opcode.SCHEMA:
@@ -154,7 +160,7 @@ def _part(opcode: int, data: bytes, at: int, budget: _Budget) -> Part | None:
 
 
 def check_summary(file: IO[bytes]) -> None:
-    """Check that the index at the end of a finished file is there and agrees with the file.
+    """Check that the index at the end of a finished file is there, whole, and points into it.
 
     Raises:
         ValueError: It does not.
@@ -167,11 +173,16 @@ def check_summary(file: IO[bytes]) -> None:
     opcode, data, _ = next(_records(file))
     if opcode != Opcode.FOOTER or file.read(len(_MAGIC)) != _MAGIC:
         raise EOFError("the end is missing")
-    start = Footer.read(ReadDataStream(BytesIO(data))).summary_start
+    footer = Footer.read(ReadDataStream(BytesIO(data)))
+    start = footer.summary_start
     if not len(_MAGIC) < start < size - _END_BYTES:
         raise ValueError("it has no summary")
     if size - start > SUMMARY_BYTES_MAX:
         raise ValueError(f"its summary has {size - start:,} bytes")
+    file.seek(start)
+    summed = file.read(size - len(_MAGIC) - 4 - start)  # the sum is what follows
+    if footer.summary_crc not in (0, zlib.crc32(summed)):
+        raise ValueError(f"the checksum of its index, from byte {start:,}, is wrong")
     file.seek(start)
     statistics: Statistics | None = None
     chunks = 0
@@ -192,13 +203,14 @@ def check_summary(file: IO[bytes]) -> None:
 
 
 class _Budget:
-    """What may still be expanded, and the channels and schemas so far."""
+    """What may still be expanded, and the channels, schemas, chunks and messages so far."""
 
     def __init__(self, file_bytes: int) -> None:
         self._allowed = _FREE_BYTES + _RATIO_MAX * file_bytes
         self._left = self._allowed
         self._schemas: set[int] = set()
         self._channels: set[int] = set()
+        self.chunks = self.messages = 0
 
     def spend(self, size: int, at: int) -> None:
         self._left -= size
@@ -206,6 +218,15 @@ class _Budget:
             raise _BoundError(
                 f"its chunks expand to more than {self._allowed:,} bytes, found at byte {at:,}"
             )
+
+    def compare(self, statistics: Statistics) -> None:
+        """Compare the file's statistics with what was read: a chunk may have been passed over."""
+        for what, said, read in (
+            ("messages", statistics.message_count, self.messages),
+            ("chunks", statistics.chunk_count, self.chunks),
+        ):
+            if said != read:
+                raise ValueError(f"its statistics say {said:,} {what}, and {read:,} can be read")
 
     def schema(self, data: bytes, at: int) -> Schema:
         found = Schema.read(ReadDataStream(BytesIO(data)))
@@ -232,9 +253,7 @@ def _records(
     while True:
         at = file.tell()
         try:
-            found = _record(
-                file, file_bytes - at, file_bytes if on_damage is None else _PASSED_OVER_MAX
-            )
+            found = _record(file, file_bytes, on_damage)
         except (ValueError, EOFError) as error:
             if on_damage is None:
                 raise
@@ -250,18 +269,23 @@ def _records(
             yield *found, at
 
 
-def _record(file: IO[bytes], left: int, passed_over_max: int) -> tuple[int, bytes] | None:
-    """Opcode and content of the next record, ``left`` bytes before the end; None = passed over."""
+def _record(
+    file: IO[bytes], file_bytes: int, on_damage: OnDamage | None
+) -> tuple[int, bytes] | None:
+    """Opcode and content of the next record; None = passed over."""
     at = file.tell()
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         raise EOFError("the end is missing")
     opcode, size = _HEAD.unpack(head)
+    if on_damage is not None and opcode != Opcode.CHUNK and _looks_like_chunk(file, head):
+        on_damage(Damage(at, 1, f"the chunk at byte {at:,} says that it is of kind {opcode}"))
+        opcode = Opcode.CHUNK
     if opcode == 0:
         raise ValueError(f"there is no record at byte {at:,}")
     most = _BYTES_MAX.get(opcode)
     if most is None:
-        if size > passed_over_max:
+        if size > (file_bytes if on_damage is None else _PASSED_OVER_MAX):
             raise ValueError(f"the record at byte {at:,} says that it has {size:,} bytes")
         # Attachments and indices; to read them would take as long as they say they are.
         file.seek(size, os.SEEK_CUR)
@@ -271,10 +295,18 @@ def _record(file: IO[bytes], left: int, passed_over_max: int) -> tuple[int, byte
             f"the record at byte {at:,} says that it has {size:,} bytes, {most:,} are allowed"
         )
     # Else thousands of heads that say so would each have the rest of the file read.
-    data = file.read(size) if size <= left else b""
+    data = file.read(size) if size <= file_bytes - at else b""
     if len(data) < size:
         raise EOFError("the end is missing")
     return opcode, data
+
+
+def _looks_like_chunk(file: IO[bytes], head: bytes) -> bool:
+    """Whether the record of this head has the begin of a packed chunk, whatever its kind."""
+    at = file.tell()
+    begin = head[1:] + file.read(_CHUNK_HEAD_BYTES - len(head))
+    file.seek(at)
+    return _PACKED_CHUNK.match(b"\x06" + begin) is not None
 
 
 def _next_chunk(file: IO[bytes], start: int) -> int | None:

@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 from mcap.records import Channel, Metadata, Schema
 
 from palpate.bus.continuity import Holes
-from palpate.bus.topics import CONTRACT_VERSION, SCHEMAS, TOPICS, StreamAddress, parse_key
+from palpate.bus.topics import CONTRACT_VERSION, ROOT, SCHEMAS, TOPICS, StreamAddress, parse_key
 from palpate.codec.base import stamp_from_wire
 from palpate.errors import ConfigError, RecordingError, WireError, printable
 from palpate.files.bounded import open_regular
@@ -62,18 +62,34 @@ class RecordItem:
     sequence: int
 
 
+class SeveralStationsError(RecordingError):
+    """A file holds messages of more than one station; their sensors may have the same names."""
+
+
 def read_record(
-    path: Path, *, allow_partial: bool = False, on_damage: OnDamage | None = None
+    path: Path,
+    *,
+    allow_partial: bool = False,
+    on_damage: OnDamage | None = None,
+    any_station: bool = False,
 ) -> Iterator[RecordItem]:
     """Messages of a record in order of writing.
 
     With ``allow_partial`` the end may be missing, as of ``NAME.mcap.part``, and what is damaged is
     left out; ``on_damage`` is told of it.
 
+    Args:
+        path: The record.
+        allow_partial: Whether it may be cut off or damaged.
+        on_damage: Is told what is left out.
+        any_station: Whether it may hold several stations, as of ``mcap merge``: for those that tell
+            sensors apart by the whole key.
+
     Raises:
         RecordingError: Not a record of palpate, or damaged (after the messages before the damage).
+        SeveralStationsError: It holds several (after the messages before the second one).
     """
-    streams = _Streams(path, allow_partial=allow_partial)
+    streams = _Streams(path, allow_partial=allow_partial, any_station=any_station)
     count = 0
     complete = searched = False
     tell = on_damage or _ignore
@@ -142,8 +158,9 @@ class _Streams:
         known: Key, its parts, and the message's full name, by the number of the channel.
     """
 
-    def __init__(self, path: Path, *, allow_partial: bool) -> None:
-        self._path, self._allow_partial = path, allow_partial
+    def __init__(self, path: Path, *, allow_partial: bool, any_station: bool) -> None:
+        self._path, self._allow_partial, self._any_station = path, allow_partial, any_station
+        self._stations: set[str] = set()
         self._schemas: dict[int, Schema] = {}
         self.known: dict[int, tuple[str, StreamAddress, str]] = {}
 
@@ -151,7 +168,8 @@ class _Streams:
         """Take up a schema or a channel; metadata and messages say nothing.
 
         Raises:
-            RecordingError: The channel is not of palpate, or of a contract that is not known.
+            RecordingError: The channel is not of palpate, of a contract that is not known, or of a
+                second station.
             WireError: Its key is not of this contract.
         """
         if isinstance(part, Schema):
@@ -174,7 +192,15 @@ class _Streams:
                     if made_for
                     else upgrade,
                 )
-            self.known[part.id] = part.topic, parse_key(part.topic), schema.name
+            address = parse_key(part.topic)
+            self._stations.add(address.station)
+            if len(self._stations) > 1 and not self._any_station:
+                raise SeveralStationsError(
+                    f"{self._path} holds the stations {', '.join(sorted(self._stations))}",
+                    remedy="give a record of one: mcap filter FILE -o ONE.mcap -y "
+                    f"'{ROOT}/{address.station}/.*'",
+                )
+            self.known[part.id] = part.topic, address, schema.name
 
     def learn_all(self) -> None:
         """Take up those of the whole file, wherever they are named."""
@@ -192,7 +218,8 @@ def only_name(path: Path, topic: str, what: str) -> str:
         what: What has the name, and the driver's option that chooses one.
 
     Raises:
-        RecordingError: The file is not a record, or is damaged before the first message.
+        RecordingError: The file is not a record, is damaged before the first message, or holds
+            several stations.
         ConfigError: There are several names.
     """
     names: set[str] = set()
@@ -200,9 +227,9 @@ def only_name(path: Path, topic: str, what: str) -> str:
         for item in read_record(path):
             if item.address.topic == topic:
                 names.add(item.address.sensor)
-    except RecordingError:
+    except RecordingError as error:
         # The messages before the damage are delivered, and the error comes after them.
-        if not names:
+        if not names or isinstance(error, SeveralStationsError):
             raise
     if len(names) > 1:
         raise ConfigError(
@@ -252,7 +279,7 @@ def summarise(path: Path) -> RecordSummary:
     counts: Counter[str] = Counter()
     stamps = _Stamps()
     start = end = 0
-    for item in read_record(path, allow_partial=not complete):
+    for item in read_record(path, allow_partial=not complete, any_station=True):
         counts[item.key] += 1
         stamps.take(item)
         start = start or item.log_time_ns
@@ -440,7 +467,7 @@ def recover(part: Path) -> Recovery:
         first_damage = first_damage or damage
 
     facts = {**metadata_of(part), "recovered_from": part.name}
-    items = read_record(part, allow_partial=True, on_damage=on_damage)
+    items = read_record(part, allow_partial=True, on_damage=on_damage, any_station=True)
     try:
         first = next(items, None)
     except RecordingError as error:

@@ -14,13 +14,13 @@ from palpate.bus import Delivery, Session, Tap
 from palpate.bus.tares import TareBook
 from palpate.bus.topics import TARE, TOPICS, Topic
 from palpate.config import LinkConfig
-from palpate.errors import LinkError, RecordingError, StreamTimeout
+from palpate.errors import LinkError, PalpateError, RecordingError, StreamTimeout
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import beat
-from palpate.messages import ServiceState
+from palpate.messages import ServiceState, Tare
 from palpate.process import avoid_pauses
 from palpate_services.config import RecorderConfig
-from palpate_services.recorder.writer import RecordFiles
+from palpate_services.recorder.writer import FindTare, RecordFiles
 
 _log = logging.getLogger(__name__)
 
@@ -28,6 +28,9 @@ SERVICE = "recorder"
 
 _BATCH_S = 0.05
 """Samples are taken in batches: to wake up for each one would cost more than to write it [s]."""
+
+_TARES_WAIT_S = 1.0
+"""How long, in all, frames wait for the tares that they name [s]; what comes meanwhile queues."""
 
 _CHECK_AFTER = 100
 """Samples after which the disk is checked even though more samples wait."""
@@ -60,7 +63,7 @@ def run_recorder(
     topics = _topics(config.topics)
     health = health or Health(SERVICE, instance)
     with Session.open(link, station=station) as session:
-        find_tare = TareBook(session).find if TARE in topics else None
+        find_tare = _first_tares(TareBook(session)) if TARE in topics else None
         files = RecordFiles(config, station, health, find_tare)
         presence = session.presence(SERVICE, instance=instance)
         tap = session.tap(
@@ -120,6 +123,28 @@ class QueueReport:
             self._losing = False
             self._files.other_trouble_is_over()
         self._lost = lost
+
+
+def _first_tares(book: TareBook) -> FindTare:
+    """Looks up tares, and waits for the first ones: readers need a tare before its frames.
+
+    Whoever joins a running station hears frames some 0.1 s before the gateway's answer.
+    """
+    left_s = _TARES_WAIT_S
+
+    def find(sensor: str, tare_id: int) -> Tare | None:
+        nonlocal left_s
+        tare = book.find(sensor, tare_id)
+        if tare is not None or left_s <= 0:
+            return tare
+        beat()
+        began_s = time.monotonic()
+        with contextlib.suppress(PalpateError):  # it is asked for further, and recorded then
+            tare = book.baseline(sensor, tare_id, timeout_s=left_s, patient=True)
+        left_s -= time.monotonic() - began_s
+        return tare
+
+    return find
 
 
 def _drain(tap: Tap, files: RecordFiles, may_go_on: Callable[[], bool]) -> int:

@@ -188,14 +188,15 @@ class RecordFiles:
 
     Use from one thread, but for ``other_trouble_is_over``.
 
-    Frames name their tare. One that was taken before the record began is looked up and recorded,
-    too: without it nobody could read the frames.
+    Frames name their tare. One that was taken before the record began is looked up and recorded
+    before them: without it nobody could read the frames. Each tare is recorded once.
 
     Args:
         config: Where and what.
         station: Its name.
         health: Of the recorder.
-        find_tare: Looks up a tare; None = only those are recorded that come while it records.
+        find_tare: Looks up a tare, and may wait for it; None = only those are recorded that come
+            while it records.
 
     Raises:
         ConfigError: One of ``config.bundles`` does not exist.
@@ -276,7 +277,11 @@ class RecordFiles:
             ):
                 self._counts["lost_on_bus"] += hole
         if isinstance(message, Tare):
-            self._tares.add((sample.sensor, message.tare_id))
+            name = sample.sensor, message.tare_id
+            if name in self._tares:  # one that was looked up for a frame, or is told again
+                self._counts["repeated_tares"] += 1
+                return
+            self._tares.add(name)
         elif isinstance(message, ElectrodeFrame):
             self._write_tare_of(message, sample)
             if self._writer is None:  # the disk refused the tare
@@ -323,7 +328,6 @@ class RecordFiles:
             return
         tare = self._find_tare(*name)
         if tare is not None:
-            self._tares.add(name)
             self.write(
                 replace(
                     sample,

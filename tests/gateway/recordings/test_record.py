@@ -66,6 +66,21 @@ def test_one_of_several_sensors(record: Callable[..., Path]) -> None:
         messages(path, "ring")
 
 
+@pytest.mark.parametrize("sensor", ["", "finger"])
+def test_two_stations_do_not_become_one_finger(
+    record: Callable[..., Path], tmp_path: Path, sensor: str
+) -> None:
+    both = tmp_path / "both.mcap"
+    with RecordWriter(both) as writer:
+        for item in read_record(record(60)):
+            for station in ("lab", "other"):
+                key = sensor_key(station, item.address.sensor, item.address.topic)
+                writer.write(key, item.schema, item.payload, log_time_ns=item.log_time_ns)
+    for read in (recorded_sensors, lambda path: messages(path, sensor)):
+        with pytest.raises(RecordingError, match="holds the stations lab, other"):
+            read(both)
+
+
 def test_cut_record_delivers_and_then_says_so(record: Callable[..., Path]) -> None:
     path = record(60)
     whole = messages(path)
