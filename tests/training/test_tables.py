@@ -535,6 +535,30 @@ def test_rows_that_come_together_do_not_stretch_the_period(together: int) -> Non
     assert period_s == pytest.approx(1e-9 * STEP_NS, rel=1e-3)
 
 
+def _with_the_next(rows: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Some rows have the time of the next one that is not among them."""
+    times = np.where(some, len(rows), rows)
+    times[-1] = rows[-1]
+    return np.minimum.accumulate(times[::-1])[::-1]
+
+
+@pytest.mark.parametrize(
+    "stamped",
+    [
+        lambda rows: _with_the_next(rows, np.random.default_rng(0).random(len(rows)) < 1 / 3),
+        lambda rows: _with_the_next(rows, rows % 5 == 0),
+        lambda rows: rows // 1.6 * 1.6,
+        lambda rows: rows // 1.1 * 1.1,
+        lambda rows: np.where(rows < 300, 0, rows),
+        lambda rows: np.where(rows == 7, 6, rows + rows // 20),
+    ],
+    ids=["a third", "one in five", "slow clock", "nearly a row", "stood still", "rows missing"],
+)
+def test_rows_of_which_some_share_a_time_have_the_same_period(stamped: Any) -> None:
+    times = np.rint(stamped(np.arange(600)) * STEP_NS).astype(np.int64)
+    assert period_of(10**18 + times) == pytest.approx(1e-9 * STEP_NS, rel=0.01)
+
+
 def test_times_that_repeat_are_told(data: FeatureDataset) -> None:
     rows = np.arange(len(data))
     paired = timed(data, rows // 2 * 2 * STEP_NS)

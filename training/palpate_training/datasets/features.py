@@ -170,18 +170,41 @@ NOMINAL_PERIOD_S = 0.01
 
 
 def period_of(time_ns: TimeArray | None) -> float:
-    """Time between two rows of a sensor [s], the median; ``time_ns`` is that of its rows.
-
-    Rows that came together, and share their time, share the step to the next one.
-    """
+    """Time between two rows of a sensor [s]; ``time_ns`` is that of its rows, in their order."""
     if time_ns is None:
         return NOMINAL_PERIOD_S
-    steps = 1e-9 * np.diff(time_ns.astype(np.float64))
-    forward = steps[steps > 0.0]
-    if not len(forward):
-        return NOMINAL_PERIOD_S
-    together = np.count_nonzero(steps == 0.0) / len(time_ns)
-    return float(np.median(forward)) * (1.0 - together)
+    return period_of_steps(np.diff(time_ns)) or NOMINAL_PERIOD_S
+
+
+STEP_TOLERANCE = 0.5
+"""Share of a step by which a row may be early or late."""
+
+
+def period_of_steps(steps_ns: npt.NDArray[np.int64]) -> float:
+    """Time between two rows [s] by the steps of their times [ns], shape ``(N - 1,)``.
+
+    Rows of the same time are a burst, whose step to the next time is that of all its rows. Left
+    out are steps of another length, as over a missing row or back; beside a burst a step may be
+    longer, as rows may have the time of the first of the burst or of its last.
+
+    Returns:
+        The mean of the others; 0 where no step is forward.
+    """
+    ends = np.flatnonzero(steps_ns)
+    steps = 1e-9 * steps_ns[ends].astype(np.float64)
+    if not (steps > 0.0).any():
+        return 0.0
+    rows = np.diff(ends, prepend=-1, append=len(steps_ns))
+    before, longer = rows[:-1], np.maximum(rows[:-1], rows[1:])
+    period = float(np.median(steps[steps > 0.0]))
+    most = (1.0 + STEP_TOLERANCE) * period * longer
+    for _ in range(2):  # the second time by the period of rows, and not of bursts
+        kept = (steps >= (1.0 - STEP_TOLERANCE) * period) & (steps <= most)
+        if not kept.any():
+            break
+        period = float(steps[kept].sum() / before[kept].sum())
+        most = (longer + STEP_TOLERANCE) * period
+    return period
 
 
 def recording_of(data: FeatureDataset) -> IndexArray:
