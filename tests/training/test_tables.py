@@ -520,8 +520,8 @@ def test_recordings_on_other_clocks_may_be_joined(data: FeatureDataset) -> None:
     """Each recording is in order; the second may be earlier, as after a restart of the host."""
     assert data.time_ns is not None
     later = timed(data, data.time_ns)
-    force = data.force + np.float32(0.1)
-    earlier = replace(timed(data, data.time_ns - 10**18), force=force)
+    counts = data.electrodes + np.uint16(1)
+    earlier = replace(timed(data, data.time_ns - 10**18), electrodes=counts)
     both = joined([later, earlier])
     assert both.time_ns is not None
     assert both.time_ns[0] > both.time_ns[-1]

@@ -133,9 +133,7 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
         DatasetError: A part lacks a column that another one has, has another licence, or holds the
             same presses.
     """
-    refuse_repeated(
-        [part.name for part in parts], [(part.tared_counts, part.force) for part in parts]
-    )
+    refuse_same_presses([part.name for part in parts], parts)
     columns = [set(part.arrays()) for part in parts]
     for part, have in zip(parts, columns, strict=True):
         if missing := sorted(set.union(*columns) - have):
@@ -163,6 +161,41 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
         ),
         name="joined",
     )
+
+
+def refuse_same_presses(names: Sequence[str | Path], parts: Sequence[FeatureDataset]) -> None:
+    """Refuse data sets that have presses in common, whatever was made of them.
+
+    Compared are raw counts, as the force may have been paired otherwise and another rest
+    subtracted; and tared counts with the force, as the rest may have been assumed.
+
+    Args:
+        names: Of the data sets, for the error.
+        parts: The data sets.
+
+    Raises:
+        DatasetError: Two have.
+    """
+    refuse_repeated(names, [(part.tared_counts, part.force) for part in parts])
+    refuse_repeated(names, [counts_under_force(part.electrodes, part.force) for part in parts])
+
+
+def counts_under_force(
+    electrodes: CountArray, force: npt.NDArray[np.floating]
+) -> tuple[FloatArray, FloatArray]:
+    """Raw counts as ``refuse_repeated`` compares them, whatever the force of a row is.
+
+    Args:
+        electrodes: Raw counts, shape ``(N, 19)``.
+        force: Force [N], shape ``(N, 3)``.
+
+    Returns:
+        The counts, and 1 where they tell a press, shape ``(N, 1)``; 0 where there is no force, or
+        no electrode that works: such rows are the same in many recordings.
+    """
+    works = ~at_an_end(electrodes).all(axis=1, keepdims=True)
+    told = force.any(axis=1, keepdims=True) & works
+    return electrodes.astype(np.float32), told.astype(np.float32)
 
 
 NOMINAL_PERIOD_S = 0.01
