@@ -61,7 +61,7 @@ class FeatureDataset:
         group: Recording, trajectory or press that the row belongs to, shape ``(N,)``.
         block: Contiguous piece that is held out as a whole, shape ``(N,)``; unique over groups.
         sensor: Index into ``sensor_names``, shape ``(N,)``.
-        sensor_names: Names of the sensors.
+        sensor_names: Names of the sensors, each another.
         provenance: Where it comes from.
         contact_location: Tip of the indenter [m], sensor frame, shape ``(N, 3)``; NaN where there
             is no contact; None where it is not known.
@@ -483,6 +483,11 @@ def _check_values(data: FeatureDataset) -> None:
             f"{data.name}: sensor holds {data.sensor.max()}, but {len(data.sensor_names)} sensors"
             " are named",
             remedy="sensor is an index into sensor_names",
+        )
+    if len(set(data.sensor_names)) < len(data.sensor_names):
+        raise DatasetError(
+            f"{data.name}: two sensors have the same name: {', '.join(data.sensor_names)}",
+            remedy="name each sensor once; rows of one sensor have the same index",
         )
     order = np.lexsort((data.group, data.block))
     block, group = data.block[order], data.group[order]
