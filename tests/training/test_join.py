@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -140,7 +141,7 @@ def test_features_of_one_recording_are_not_joined_whatever_was_made_of_them(
 ) -> None:
     data = press_data(3, 20, 1)
     rest = data.baseline + np.float32(3.0)
-    again = {
+    again: dict[str, dict[str, Any]] = {
         "paired otherwise": {"force": np.roll(data.force, 2, axis=0)},
         "tared otherwise": {"baseline": rest},
         "another rest assumed": {"baseline": rest, "electrodes": data.electrodes + np.uint16(3)},
