@@ -69,6 +69,9 @@ TIERS = {
     "test": Tier(file_s=8.0, always_s=0.1, first_s=20.0, fixture_s=20.0, keeps="essential"),
 }
 
+SELECTING = ("keyword", "markexpr", "lf", "deselect", "tier")
+"""Options that leave out some tests of a file."""
+
 UNKNOWN_S = 20.0
 """What the order of a parallel run expects of a file that was never measured [s]: it may be long,
 so it must not begin last."""
@@ -108,7 +111,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     # Reports of a parallel run arrive at the process that started the workers.
     if config.getoption("--record-durations") and not hasattr(config, "workerinput"):
-        if config.getoption("keyword") or any("::" in one for one in config.args):
+        some = any(config.getoption(name, None) for name in SELECTING)
+        if some or any("::" in one for one in config.args):
             raise pytest.UsageError("--record-durations measures whole files: name no single tests")
         config.pluginmanager.register(_Recording())
 
@@ -132,7 +136,7 @@ def pytest_collection() -> Generator[None, object, object]:
 class _Recording:
     """Adds up what each test and each shared fixture takes, and writes what tiers leave out.
 
-    What is known of files that do not run now is kept.
+    What is known of files that do not run now is kept; all of it if the run was interrupted.
     """
 
     def __init__(self) -> None:
@@ -152,7 +156,9 @@ class _Recording:
                 self._seconds[file][test] -= seconds
                 self._fixtures[name] = round(seconds, 1)
 
-    def pytest_sessionfinish(self) -> None:
+    def pytest_sessionfinish(self, exitstatus: int) -> None:
+        if exitstatus not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+            return
         shortest = min(tier.fixture_s for tier in TIERS.values())
         files = {
             file: {"seconds": round(self._files[file], 1)}
@@ -165,7 +171,8 @@ class _Recording:
         for new, known in ((files, recorded["files"]), (fixtures, recorded["fixtures"])):
             for name, entry in known.items():
                 file = name.partition("::")[0]
-                if file not in self._seconds and (ROOT / file).exists():
+                anew = file in self._seconds or name in self._fixtures
+                if not anew and (ROOT / file).exists():
                     new.setdefault(name, entry)
         table = {"fixtures": dict(sorted(fixtures.items())), "files": dict(sorted(files.items()))}
         DURATIONS.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")

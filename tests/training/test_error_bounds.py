@@ -288,6 +288,11 @@ def test_what_cannot_calibrate_is_refused(
     write_dataset(tmp_path / "half.h5", press_data(presses=PRESSES_LEAST // 2, seed=1))
     with pytest.raises(DatasetError, match="hold the same presses"):
         add_intervals(trained, [tmp_path / "half.h5", tmp_path / "half.h5"], out)
+    half = press_data(presses=PRESSES_LEAST // 2, seed=1)
+    late = replace(half, force=np.roll(half.force, 2, axis=0))
+    write_dataset(tmp_path / "late.h5", late)
+    with pytest.raises(DatasetError, match="hold the same presses"):
+        add_intervals(trained, [tmp_path / "half.h5", tmp_path / "late.h5"], out)
     write_dataset(tmp_path / "few.h5", press_data(presses=PRESSES_LEAST - 1, seed=1))
     with pytest.raises(DatasetError, match=f"{PRESSES_LEAST} are needed"):
         add_intervals(trained, [tmp_path / "few.h5"], out)

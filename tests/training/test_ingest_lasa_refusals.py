@@ -47,6 +47,17 @@ def test_counts_that_no_biotac_sends(tmp_path: Path, value: float, told: str) ->
         ingest_lasa(archive(tmp_path, **arrays))
 
 
+@pytest.mark.parametrize("fingers", [(), (2,)])
+def test_a_number_with_a_zero_in_front_is_not_left_out(
+    tmp_path: Path, fingers: tuple[int, ...]
+) -> None:
+    zero = {name.replace("finger2", "finger02"): array for name, array in finger(2).items()}
+    path = archive(tmp_path, **finger(1), **zero)
+    with pytest.raises(DatasetError, match=r"finger02_electrodes_raw, .* zeros in front"):
+        ingest_lasa(path, fingers=fingers)
+    assert len(ingest_lasa(path, fingers=(1,), lag_rows=0)) == ROWS
+
+
 def test_counts_are_checked_where_the_lag_leaves_them_out(tmp_path: Path) -> None:
     arrays = finger(9)
     arrays["finger9_electrodes_raw"][0, 0] = -65000
@@ -134,7 +145,9 @@ def test_a_force_without_electrodes(tmp_path: Path) -> None:
 
 def test_names_with_zeros_in_front(tmp_path: Path) -> None:
     arrays = {name.replace("finger1_", "finger01_"): value for name, value in finger(1).items()}
-    with pytest.raises(DatasetError, match="it has: finger01_electrodes_raw") as refused:
+    with pytest.raises(
+        DatasetError, match=r"has finger01_electrodes_raw, .* zeros in front"
+    ) as refused:
         ingest_lasa(archive(tmp_path, **arrays))
     assert "finger1_electrodes_raw" in str(refused.value.remedy)
 

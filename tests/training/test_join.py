@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -132,6 +133,33 @@ def test_joined_features_keep_presses_apart(press_data: Callable[..., FeatureDat
         joined([one, paid])
     with pytest.raises(DatasetError, match="hold the same presses: "):
         joined([one, other, replace(one, sensor_names=("third",))])
+
+
+@pytest.mark.parametrize("changed", ["paired otherwise", "tared otherwise", "another rest assumed"])
+def test_features_of_one_recording_are_not_joined_whatever_was_made_of_them(
+    press_data: Callable[..., FeatureDataset], changed: str
+) -> None:
+    data = press_data(3, 20, 1)
+    rest = data.baseline + np.float32(3.0)
+    again: dict[str, dict[str, Any]] = {
+        "paired otherwise": {"force": np.roll(data.force, 2, axis=0)},
+        "tared otherwise": {"baseline": rest},
+        "another rest assumed": {"baseline": rest, "electrodes": data.electrodes + np.uint16(3)},
+    }
+    with pytest.raises(DatasetError, match="hold the same presses: "):
+        joined([data, replace(data, **again[changed])])
+
+
+def test_features_with_the_same_rows_of_rest_are_joined(
+    press_data: Callable[..., FeatureDataset],
+) -> None:
+    """Simulated electrodes have no noise, the force of an untouched finger may have some."""
+    data, other = (press_data(2, 200, seed) for seed in (1, 2))
+    other.baseline[:] = data.baseline[:1]
+    for number, one in enumerate((data, other)):
+        one.electrodes[100:200] = np.rint(data.baseline[0]).astype(np.uint16)
+        one.force[100:200] = np.float32(0.001 * (1 + number))
+    assert len(joined([data, other])) == 800
 
 
 def test_a_part_and_what_it_is_of_are_not_joined(large: MixedDataset, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,3 +74,35 @@ def test_times_in_whole_milliseconds_are_one_episode(tmp_path: Path) -> None:
     rounded = replace(data, time_ns=data.time_ns // 1_000_000 * 1_000_000)
     assert export_lerobot(tmp_path / "set", rounded) == 1
     assert largest_error_s(tmp_path / "set") < 0.002
+
+
+@pytest.mark.parametrize("fps", [None, 100.0])
+@pytest.mark.parametrize("row", [0, 1], ids=["of the first", "of the last"])
+def test_rows_that_share_a_time_are_one_episode(
+    tmp_path: Path, row: int, fps: float | None
+) -> None:
+    """Rows sent in pairs, with the time of one of them: 100 a second, and no row is missing."""
+    data = rows_at(100.0)
+    assert data.time_ns is not None
+    pairs = replace(data, time_ns=np.repeat(data.time_ns[row::2], 2))
+    assert export_lerobot(tmp_path / "set", pairs, fps=fps) == 1
+    info = json.loads((tmp_path / "set/meta/info.json").read_text(encoding="utf-8"))
+    assert info["fps"] == 100
+    assert largest_error_s(tmp_path / "set") <= 0.01001
+
+
+def test_an_episode_ends_where_a_burst_of_rows_is_missing(tmp_path: Path) -> None:
+    data = rows_at(100.0)
+    assert data.time_ns is not None
+    times = np.repeat(data.time_ns[::2], 2)
+    times[100:] += 20_000_000
+    with_a_hole = replace(data, time_ns=times)
+    assert export_lerobot(tmp_path / "set", with_a_hole) == 2
+
+
+def test_a_time_twice_ends_no_episode(tmp_path: Path) -> None:
+    data = rows_at(100.0)
+    assert data.time_ns is not None
+    times = data.time_ns.copy()
+    times[4::5] = times[3::5]
+    assert export_lerobot(tmp_path / "set", replace(data, time_ns=times)) == 1

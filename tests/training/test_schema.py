@@ -120,6 +120,10 @@ def _replace(name: str, values: Any, unit: str) -> Callable[[Any], None]:
         (_replace("force", np.zeros((59, 3), np.float32), "N"), r"force has shape \(59, 3\)"),
         (_replace("force", np.zeros((60, 3), np.float64), "N"), "force is float64"),
         (_replace("block", np.zeros(60, np.int32), "1"), "block 0 spans groups"),
+        (
+            lambda f: f.attrs.__setitem__("sensor_names", ["one", "one"]),
+            "two sensors have the same name: one, one",
+        ),
     ],
 )
 def test_a_broken_file_is_named(path: Path, change: Callable[[Any], None], words: str) -> None:

@@ -520,8 +520,8 @@ def test_recordings_on_other_clocks_may_be_joined(data: FeatureDataset) -> None:
     """Each recording is in order; the second may be earlier, as after a restart of the host."""
     assert data.time_ns is not None
     later = timed(data, data.time_ns)
-    force = data.force + np.float32(0.1)
-    earlier = replace(timed(data, data.time_ns - 10**18), force=force)
+    counts = data.electrodes + np.uint16(1)
+    earlier = replace(timed(data, data.time_ns - 10**18), electrodes=counts)
     both = joined([later, earlier])
     assert both.time_ns is not None
     assert both.time_ns[0] > both.time_ns[-1]
@@ -533,6 +533,30 @@ def test_rows_that_come_together_do_not_stretch_the_period(together: int) -> Non
     gap = 10**9 * (rows >= 300)
     period_s = period_of(10**18 + rows * STEP_NS + gap)
     assert period_s == pytest.approx(1e-9 * STEP_NS, rel=1e-3)
+
+
+def _with_the_next(rows: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Some rows have the time of the next one that is not among them."""
+    times = np.where(some, len(rows), rows)
+    times[-1] = rows[-1]
+    return np.minimum.accumulate(times[::-1])[::-1]
+
+
+@pytest.mark.parametrize(
+    "stamped",
+    [
+        lambda rows: _with_the_next(rows, np.random.default_rng(0).random(len(rows)) < 1 / 3),
+        lambda rows: _with_the_next(rows, rows % 5 == 0),
+        lambda rows: rows // 1.6 * 1.6,
+        lambda rows: rows // 1.1 * 1.1,
+        lambda rows: np.where(rows < 300, 0, rows),
+        lambda rows: np.where(rows == 7, 6, rows + rows // 20),
+    ],
+    ids=["a third", "one in five", "slow clock", "nearly a row", "stood still", "rows missing"],
+)
+def test_rows_of_which_some_share_a_time_have_the_same_period(stamped: Any) -> None:
+    times = np.rint(stamped(np.arange(600)) * STEP_NS).astype(np.int64)
+    assert period_of(10**18 + times) == pytest.approx(1e-9 * STEP_NS, rel=0.01)
 
 
 def test_times_that_repeat_are_told(data: FeatureDataset) -> None:

@@ -65,6 +65,22 @@ def test_inspect_shows_units_and_provenance(press_data: MakeData, tmp_path: Path
         assert word in result.output
 
 
+@pytest.mark.parametrize("name", ["index[left]", "a[/b]"])
+def test_inspect_tells_a_sensor_by_its_whole_name(
+    press_data: MakeData, tmp_path: Path, name: str
+) -> None:
+    data = replace(press_data(presses=3), sensor_names=(name,))
+    data.electrodes[:, 4] = 4095
+    source = replace(data.provenance, source="table[bold]", command="run[/]", notes="n[red]")
+    write_dataset(tmp_path / "p.h5", replace(data, provenance=source))
+    result = CliRunner().invoke(
+        data_app, ["inspect", str(tmp_path / "p.h5")], env={"COLUMNS": "200"}
+    )
+    assert result.exit_code == 0, result.output
+    for word in (f"sensors {name}", f"range: {name}: E5", "table[bold]", "run[/]", "n[red]"):
+        assert word in result.output
+
+
 def test_inspect_names_every_schema_that_it_knows(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file.attrs["schema"] = "something.else"

@@ -471,6 +471,18 @@ def test_command_prints_json(tmp_path: Path, shots: int) -> None:
     assert "90 % intervals" in table.output
 
 
+def test_the_command_tells_fingers_by_their_whole_names(tmp_path: Path) -> None:
+    names = ("index[left]", "a[/b]")
+    for seed, name in enumerate(names, start=1):
+        data = invented(seed, name=name)
+        data.electrodes[:100, 4] = 4095
+        write_dataset(tmp_path / f"{seed}.h5", data)
+    arguments = ["transfer", "--train", str(tmp_path / "1.h5"), "--test", str(tmp_path / "2.h5")]
+    done = CliRunner().invoke(train_app, arguments, env={"COLUMNS": "200"}, catch_exceptions=False)
+    for words in ("a[/b], from index[left], with", *(f"Electrodes of {name}" for name in names)):
+        assert words in done.output
+
+
 def test_the_prior_is_the_line_that_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

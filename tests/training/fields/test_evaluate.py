@@ -113,6 +113,11 @@ def test_features_of_both_kinds_of_file_and_of_one_specimen(of_features: Path) -
     for name in ("mixed.h5", "features.h5"):
         with pytest.raises(DatasetError, match="hold the same presses"):
             evaluate(folder / "bundle", [folder / "mixed.h5", folder / name])
+    paired = open_dataset(folder / "features.h5")
+    paired.force[:] = np.roll(paired.force, 1, axis=0)
+    write_dataset(folder / "paired.h5", paired)
+    with pytest.raises(DatasetError, match="hold the same presses"):
+        evaluate(folder / "bundle", [folder / "mixed.h5", folder / "paired.h5"])
     own = evaluate(folder / "bundle", [folder / "mixed.h5"], unit=UNIT)
     assert 0 < own.rows < mixed.rows
     by_bin = [one.rows for one in found.figures if one.name == "force_magnitude"]

@@ -12,6 +12,7 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from palpate.errors import ConfigError
 from palpate.files.hdf5 import schema_of
@@ -42,7 +43,7 @@ from palpate_training.datasets.shrink import SMALL, SmallSize, shrink_file
 from palpate_training.datasets.tables import ColumnMap, dataset_of, export_table, read_table
 from palpate_training.datasets.trials import TRIALS_SCHEMA
 
-console = Console()
+console = Console(markup=False)  # names of sensors and files may have brackets
 
 SENSORS_TOLD = 4
 """Sensors of a data set whose electrodes at an end of the range are told one by one."""
@@ -103,7 +104,7 @@ def data_ingest_record(
 
     palpate data ingest-record presses.mcap presses.h5
     """
-    with console.status(f"reading {source.name}"):
+    with console.status(Text(f"reading {source.name}")):
         data = ingest_record(source, command=typed_command(), licence=licence)
         write_dataset(out, data)
     console.print(contents(data, str(out)))
@@ -285,7 +286,7 @@ def data_shrink(
     palpate data shrink mixed.h5 small.h5 --trials 5000
     """
     size = SmallSize(trials, rows, modes, force_modes)
-    with console.status(f"reading {path.name}"):
+    with console.status(Text(f"reading {path.name}")):
         small = shrink_file(path, out, size, command=typed_command())
     _show_written(small, out)
 
@@ -373,14 +374,14 @@ def _features_summary(data: FeatureDataset) -> dict[str, Any]:
     }
 
 
-def _told_ends(data: FeatureDataset) -> Iterator[str]:
+def _told_ends(data: FeatureDataset) -> Iterator[Text]:
     """Electrodes at an end of the converter's range, a line for each of the first sensors."""
     ends = electrodes_at_ends(data)
     for sensor, electrodes in itertools.islice(ends.items(), SENSORS_TOLD):
         told = ", ".join(f"{name} in {rows} rows" for name, rows in electrodes.items())
-        yield f"[yellow]at an end of the converter's range: {sensor}: {told}[/]"
+        yield Text(f"at an end of the converter's range: {sensor}: {told}", "yellow")
     if len(ends) > SENSORS_TOLD:
-        yield f"[yellow]and electrodes of {len(ends) - SENSORS_TOLD} more sensors[/]"
+        yield Text(f"and electrodes of {len(ends) - SENSORS_TOLD} more sensors", "yellow")
 
 
 def contents(data: FeatureDataset, title: str) -> Table:
@@ -447,7 +448,6 @@ def data_figures(
             f"--public-data {public_data}: there is no such folder",
             remedy="give the folder with lasa_force_calibration and lasa_contact_normal",
         )
-    console = Console()
     folder = public_data or PUBLIC_DATA
     with console.status("reading") as status:
         sources = PageSources(

@@ -13,6 +13,7 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from palpate import __version__
 from palpate.errors import ConfigError
@@ -23,7 +24,7 @@ from palpate_training.datasets.trials import TrialsContents, read_contents, writ
 from palpate_training.experiment.kinematics import ArmKinematics
 from palpate_training.experiment.plan import ARMS
 
-console = Console()
+console = Console(markup=False)  # names of sensors and files may have brackets
 
 TIMES_COLUMNS = ["trajectory", "start_wall_ns"]
 """Header of the CSV file of ``--starts``."""
@@ -41,10 +42,12 @@ ToolOption = Annotated[
 
 
 def new_table(
-    title: str, caption: Sequence[str], words: Sequence[str], numbers: Sequence[str]
+    title: str, caption: Sequence[str | Text], words: Sequence[str], numbers: Sequence[str]
 ) -> Table:
     """A table with columns of words, then columns of numbers, and lines below it."""
-    table = Table(title=title, caption="\n".join(caption), caption_justify="left")
+    lines = (line if isinstance(line, Text) else Text(line) for line in caption)
+    below = Text("\n", "table.caption").join(lines)
+    table = Table(title=title, caption=below, caption_justify="left")
     for heading in (*words, *numbers):
         table.add_column(heading, justify="right" if heading in numbers else "left")
     return table
@@ -134,7 +137,7 @@ def data_ingest(
             f"--joints for {_named(logs)}, --urdf for {_named(arms)}",
             remedy="give a joint log and a URDF for the same arms",
         )
-    with console.status(f"reading {record.name}"):
+    with console.status(Text(f"reading {record.name}")):
         trials = ingest_experiment(
             record,
             plan,

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from palpate_training.evaluation.study import Study, StudySource
     from palpate_training.tasks.evaluate import BundleErrors
 
-console = Console()
+console = Console(markup=False)  # names of sensors and files may have brackets
 
 
 def _words(text: str) -> tuple[str, ...]:
@@ -172,12 +172,12 @@ def train_evaluate(
     if found.task == "synthesis":  # no key of its manifest names the specimen, only this line
         console.print(
             f"Electrodes of {unit}, synthesised by a network of one specimen: {found.training}",
-            markup=False,
         )
     if found.trained_on:
         console.print(
             "[bold]It was trained on presses of these data sets:[/bold] these are known to it. Take"
-            " presses that no training has seen."
+            " presses that no training has seen.",
+            markup=True,
         )
     if out is not None:
         with written_whole(out) as part:

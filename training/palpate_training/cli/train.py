@@ -65,7 +65,7 @@ WIDTH, BLOCKS = 256, 3
 GAIN_SPREAD = 0.1
 """The defaults of ``MembersConfig``, whose module needs torch."""
 
-console = Console()
+console = Console(markup=False)  # names of sensors and files may have brackets
 
 
 def train_field(
@@ -509,7 +509,6 @@ def train_upgrade(
         console.print(
             f"its range is of {data}, which is not what it was trained on: palpate train intervals"
             " cannot tell presses that its training saw, so hold out those that it did not",
-            markup=False,
         )
 
 
@@ -536,7 +535,6 @@ def train_location(
     console.print(
         f"location on presses that nothing was learned from: {report.after_m * 1e3:.3f} mm"
         f" (median), before {report.before_m * 1e3:.3f} mm",
-        markup=False,
     )
     console.print(f"wrote {out}, digest {report.digest.hex()}")
 

@@ -174,7 +174,8 @@ def refuse_repeated(
 ) -> None:
     """Refuse presses that are in two data sets: they would count twice, and be tested on.
 
-    Rows are compared, not digests: a copy may be shrunk, or have come back from a table.
+    Rows are compared, not digests: a copy may be shrunk, or have come back from a table. Equal rows
+    of a data set count once.
 
     Args:
         names: Of the data sets.
@@ -187,7 +188,7 @@ def refuse_repeated(
     for number, (tared, force) in enumerate(parts):
         codes = _row_codes(np.hstack([tared, force])[np.any(force != 0.0, axis=1)])
         for first, others in enumerate(known):
-            same = int(np.isin(codes, others).sum())
+            same = len(np.intersect1d(codes, others, assume_unique=True))
             if same > REPEATED_SHARE * min(len(codes), len(others)):
                 raise DatasetError(
                     f"{names[number]} and {names[first]} hold the same presses: {same} rows",
@@ -197,10 +198,11 @@ def refuse_repeated(
 
 
 def _row_codes(rows: npt.NDArray[np.floating]) -> npt.NDArray[np.uint64]:
-    """A number of each row (N, K), as float32; others have the same by chance only."""
+    """A number of each row (N, K), as float32, sorted and once; others have it by chance only."""
     words = np.ascontiguousarray(rows, np.float32).view(np.uint32).astype(np.uint64)
     weights = np.random.default_rng(0).integers(1, 2**63, words.shape[1], dtype=np.uint64)
-    return np.asarray((words * weights).sum(axis=1, dtype=np.uint64))
+    codes = np.sort(words @ weights)  # np.unique takes 50 times as long
+    return np.concatenate([codes[:1], codes[1:][np.diff(codes) != 0]])
 
 
 def write_tables(

@@ -61,7 +61,7 @@ class FeatureDataset:
         group: Recording, trajectory or press that the row belongs to, shape ``(N,)``.
         block: Contiguous piece that is held out as a whole, shape ``(N,)``; unique over groups.
         sensor: Index into ``sensor_names``, shape ``(N,)``.
-        sensor_names: Names of the sensors.
+        sensor_names: Names of the sensors, each another.
         provenance: Where it comes from.
         contact_location: Tip of the indenter [m], sensor frame, shape ``(N, 3)``; NaN where there
             is no contact; None where it is not known.
@@ -133,9 +133,7 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
         DatasetError: A part lacks a column that another one has, has another licence, or holds the
             same presses.
     """
-    refuse_repeated(
-        [part.name for part in parts], [(part.tared_counts, part.force) for part in parts]
-    )
+    refuse_same_presses([part.name for part in parts], parts)
     columns = [set(part.arrays()) for part in parts]
     for part, have in zip(parts, columns, strict=True):
         if missing := sorted(set.union(*columns) - have):
@@ -165,23 +163,81 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
     )
 
 
+def refuse_same_presses(names: Sequence[str | Path], parts: Sequence[FeatureDataset]) -> None:
+    """Refuse data sets that have presses in common, whatever was made of them.
+
+    Compared are raw counts, as the force may have been paired otherwise and another rest
+    subtracted; and tared counts with the force, as the rest may have been assumed.
+
+    Args:
+        names: Of the data sets, for the error.
+        parts: The data sets.
+
+    Raises:
+        DatasetError: Two have.
+    """
+    refuse_repeated(names, [(part.tared_counts, part.force) for part in parts])
+    refuse_repeated(names, [counts_under_force(part.electrodes, part.force) for part in parts])
+
+
+def counts_under_force(
+    electrodes: CountArray, force: npt.NDArray[np.floating]
+) -> tuple[FloatArray, FloatArray]:
+    """Raw counts as ``refuse_repeated`` compares them, whatever the force of a row is.
+
+    Args:
+        electrodes: Raw counts, shape ``(N, 19)``.
+        force: Force [N], shape ``(N, 3)``.
+
+    Returns:
+        The counts, and 1 where they tell a press, shape ``(N, 1)``; 0 where there is no force, or
+        no electrode that works: such rows are the same in many recordings.
+    """
+    works = ~at_an_end(electrodes).all(axis=1, keepdims=True)
+    told = force.any(axis=1, keepdims=True) & works
+    return electrodes.astype(np.float32), told.astype(np.float32)
+
+
 NOMINAL_PERIOD_S = 0.01
 """Time between rows where a data set has no times: a BioTac's 100 Hz."""
 
 
 def period_of(time_ns: TimeArray | None) -> float:
-    """Time between two rows of a sensor [s], the median; ``time_ns`` is that of its rows.
-
-    Rows that came together, and share their time, share the step to the next one.
-    """
+    """Time between two rows of a sensor [s]; ``time_ns`` is that of its rows, in their order."""
     if time_ns is None:
         return NOMINAL_PERIOD_S
-    steps = 1e-9 * np.diff(time_ns.astype(np.float64))
-    forward = steps[steps > 0.0]
-    if not len(forward):
-        return NOMINAL_PERIOD_S
-    together = np.count_nonzero(steps == 0.0) / len(time_ns)
-    return float(np.median(forward)) * (1.0 - together)
+    return period_of_steps(np.diff(time_ns)) or NOMINAL_PERIOD_S
+
+
+STEP_TOLERANCE = 0.5
+"""Share of a step by which a row may be early or late."""
+
+
+def period_of_steps(steps_ns: npt.NDArray[np.int64]) -> float:
+    """Time between two rows [s] by the steps of their times [ns], shape ``(N - 1,)``.
+
+    Rows of the same time are a burst, whose step to the next time is that of all its rows. Left
+    out are steps of another length, as over a missing row or back; beside a burst a step may be
+    longer, as rows may have the time of the first of the burst or of its last.
+
+    Returns:
+        The mean of the others; 0 where no step is forward.
+    """
+    ends = np.flatnonzero(steps_ns)
+    steps = 1e-9 * steps_ns[ends].astype(np.float64)
+    if not (steps > 0.0).any():
+        return 0.0
+    rows = np.diff(ends, prepend=-1, append=len(steps_ns))
+    before, longer = rows[:-1], np.maximum(rows[:-1], rows[1:])
+    period = float(np.median(steps[steps > 0.0]))
+    most = (1.0 + STEP_TOLERANCE) * period * longer
+    for _ in range(2):  # the second time by the period of rows, and not of bursts
+        kept = (steps >= (1.0 - STEP_TOLERANCE) * period) & (steps <= most)
+        if not kept.any():
+            break
+        period = float(steps[kept].sum() / before[kept].sum())
+        most = (longer + STEP_TOLERANCE) * period
+    return period
 
 
 def recording_of(data: FeatureDataset) -> IndexArray:
@@ -427,6 +483,11 @@ def _check_values(data: FeatureDataset) -> None:
             f"{data.name}: sensor holds {data.sensor.max()}, but {len(data.sensor_names)} sensors"
             " are named",
             remedy="sensor is an index into sensor_names",
+        )
+    if len(set(data.sensor_names)) < len(data.sensor_names):
+        raise DatasetError(
+            f"{data.name}: two sensors have the same name: {', '.join(data.sensor_names)}",
+            remedy="name each sensor once; rows of one sensor have the same index",
         )
     order = np.lexsort((data.group, data.block))
     block, group = data.block[order], data.group[order]

@@ -341,6 +341,7 @@ lowers the error on validation blocks (training/LOG.md); 0 takes the rows as sto
 _LASA_ARRAYS = ("electrodes_raw", "baseline_mean", "force_N")
 
 _LASA_KEY = re.compile(rf"finger(0|[1-9][0-9]*)_({'|'.join(_LASA_ARRAYS)})")
+_LASA_KEY_ZEROS = re.compile(rf"finger(0[0-9]+)_({'|'.join(_LASA_ARRAYS)})")
 
 _NOTES = (
     "force rotated from the authors' axes (x lateral, y distal, z ventral) to the sensor frame:"
@@ -373,8 +374,9 @@ def ingest_lasa(
 
     Raises:
         DatasetError: The archive is missing, damaged, or not this one; it lacks a finger or one of
-            its arrays; a finger's arrays do not fit together, or hold what is no raw count or no
-            fingertip's force in newtons; a finger is named twice.
+            its arrays, or has one of a number with zeros in front; a finger's arrays do not fit
+            together, or hold what is no raw count or no fingertip's force in newtons; a finger is
+            named twice.
     """
     if len(set(fingers)) < len(fingers):
         raise DatasetError(
@@ -459,8 +461,17 @@ def _fingers_held(path: Path, names: Sequence[str], fingers: Sequence[int]) -> l
     """The fingers to read: those asked for, or all of which an archive with these names has any.
 
     Raises:
-        DatasetError: It lacks one of them, or one of its arrays.
+        DatasetError: It lacks one of them, or one of its arrays, or names one with zeros in front.
     """
+    if zeros := [
+        name
+        for name in names
+        if (match := _LASA_KEY_ZEROS.fullmatch(name)) and (not fingers or int(match[1]) in fingers)
+    ]:
+        raise DatasetError(
+            f"{path} has {', '.join(zeros)}: numbers with zeros in front",
+            remedy="name the arrays without them, as finger1_electrodes_raw",
+        )
     held: dict[int, set[str]] = {}
     for name in names:
         if match := _LASA_KEY.fullmatch(name):
@@ -468,8 +479,8 @@ def _fingers_held(path: Path, names: Sequence[str], fingers: Sequence[int]) -> l
     if not held:
         raise DatasetError(
             f"{path} holds no finger; it has: {', '.join(names[:12]) or 'nothing'}",
-            remedy="give arrays finger1_electrodes_raw, finger1_baseline_mean and finger1_force_N"
-            " (or of another number, without zeros in front)",
+            remedy="give arrays finger1_electrodes_raw, finger1_baseline_mean and finger1_force_N,"
+            " or of another number",
         )
     chosen = list(fingers) or sorted(held)
     for finger in chosen:

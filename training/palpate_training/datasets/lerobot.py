@@ -7,8 +7,9 @@ versions 2 and 3, in order.
 
 An episode is a run of rows of one press at an even rate: LeRobot computes times from the number of
 a frame, and refuses others. A row whose time differs from that by more than half a step begins the
-next one. The true time of a row stays in the feature ``time_ns``, its finger in ``sensor``, its
-press in ``group`` and ``block``.
+next one; rows that share a time do not, as long as it can be that of one of them. The true time of
+a row stays in the feature ``time_ns``, its finger in ``sensor``, its press in ``group`` and
+``block``.
 """
 
 from __future__ import annotations
@@ -24,7 +25,12 @@ import numpy.typing as npt
 from palpate.errors import DatasetError
 from palpate.process import require
 from palpate_training.datasets.export import written_new
-from palpate_training.datasets.features import ELECTRODES, FeatureDataset
+from palpate_training.datasets.features import (
+    ELECTRODES,
+    STEP_TOLERANCE,
+    FeatureDataset,
+    period_of_steps,
+)
 from palpate_training.datasets.tables import LISTS, METADATA, facts_of, read_table
 
 if TYPE_CHECKING:
@@ -35,9 +41,6 @@ TASK = "press the finger"
 
 _NAMES = {ELECTRODES: [f"E{number + 1}" for number in range(ELECTRODES)], 3: list("xyz")}
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-_STEP_TOLERANCE = 0.5
-"""Share of a step by which a row may be early or late."""
-
 _RATE_TOLERANCE = 0.02
 """Share by which a sensor's rows a second may differ from the rate of all."""
 
@@ -150,11 +153,12 @@ def _rate(data: FeatureDataset, fps: float | None) -> float:
             raise DatasetError(f"{data.name}: rows have no times", remedy=remedy)
         return float(fps)
     steps = np.diff(data.time_ns)
-    same = (np.diff(data.group) == 0) & (np.diff(data.sensor) == 0) & (steps > 0)
+    same = (np.diff(data.group) == 0) & (np.diff(data.sensor) == 0)
+    # Rounded to what people call such a rate: 100 and not 99.998 a second.
     rates = {
-        name: _even_rate(own)
+        name: float(f"{1.0 / period_s:.4g}")
         for number, name in enumerate(data.sensor_names)
-        if len(own := steps[same & (data.sensor[1:] == number)])
+        if (period_s := period_of_steps(steps[same & (data.sensor[1:] == number)]))
     }
     if fps is None and not rates:
         raise DatasetError(
@@ -172,25 +176,25 @@ def _rate(data: FeatureDataset, fps: float | None) -> float:
     return rate
 
 
-def _even_rate(steps_ns: Ints) -> float:
-    """Rows a second by the steps between them [ns], those over a missing row aside."""
-    usual = np.median(steps_ns)
-    even = steps_ns[np.abs(steps_ns - usual) <= _STEP_TOLERANCE * usual]
-    # Rounded to what people call such a rate: 100 and not 99.998 a second.
-    return float(f"{1e9 / float(np.mean(even)):.4g}")
-
-
 def _episodes(data: FeatureDataset, rate: float) -> Ints:
     """Number of each row's episode: it ends with a press, a sensor, and where a row is missing."""
     new = (np.diff(data.group) != 0) | (np.diff(data.sensor) != 0)
     if data.time_ns is not None:
-        since_s = 1e-9 * (data.time_ns - data.time_ns[0])
-        late = since_s * rate - np.arange(len(data))
-        first = 0
-        for row in range(1, len(data)):
-            new[row - 1] |= abs(late[row] - late[first]) > _STEP_TOLERANCE
+        other = np.concatenate([[True], new | (np.diff(data.time_ns) != 0)])
+        first = np.flatnonzero(other)
+        last = np.append(first[1:], len(data)) - 1
+        since_s = 1e-9 * (data.time_ns[first] - data.time_ns[0])
+        # How late an episode began, in rows, by those of one time: it may be that of any of them.
+        least, most = since_s * rate - last, since_s * rate - first
+        low, high = least[0], most[0]
+        for at in range(1, len(first)):
+            row = first[at]
+            early, late = most[at] + STEP_TOLERANCE, least[at] - STEP_TOLERANCE
+            new[row - 1] |= early < low or late > high
             if new[row - 1]:
-                first = row
+                low, high = least[at], most[at]
+            else:
+                low, high = max(low, late), min(high, early)
     return np.concatenate([[0], np.cumsum(new)]).astype(np.int64)
 
 

@@ -21,8 +21,8 @@ from palpate.errors import DatasetError
 from palpate_training.datasets.container import refuse_repeated
 from palpate_training.datasets.features import (
     FeatureDataset,
-    at_an_end,
     check_learnable,
+    counts_under_force,
     of_sensor,
     period_of,
     rows_at_ends,
@@ -121,14 +121,8 @@ def refuse_same(names: Sequence[str], fingers: Sequence[Finger]) -> None:
     Raises:
         DatasetError: Two have.
     """
-    parts = []
-    for one in fingers:
-        counts = one.recording.electrodes
-        # Rows without any signal are the same in many recordings.
-        lost = at_an_end(counts).all(axis=1, keepdims=True)
-        told = one.recording.force.any(axis=1, keepdims=True) & ~lost
-        parts.append((counts.astype(np.float32), np.asarray(told, np.float32)))
-    refuse_repeated(names, parts)
+    recordings = [one.recording for one in fingers]
+    refuse_repeated(names, [counts_under_force(one.electrodes, one.force) for one in recordings])
 
 
 def first_seconds(finger: Finger, seconds: float, *, most: int) -> tuple[KnownRows, Floats, Rows]:

@@ -33,6 +33,7 @@ from palpate_training.datasets.features import (
     FloatArray,
     open_dataset,
     press_of,
+    refuse_same_presses,
 )
 from palpate_training.learning.contact_code import spread_forces_in_parts
 from palpate_training.learning.export import session_of
@@ -228,6 +229,7 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
     about: list[tuple[str, str]] = []
     digests: set[str] = set()
     parts: list[_Errors] = []
+    sets: list[FeatureDataset] = []
     given: list[tuple[FloatArray, FloatArray]] = []
     inputs: list[FloatArray] = []
     assumed_n = None
@@ -236,7 +238,7 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
             data, provenance, digest = read_features(path)
             if data.in_contact is None:
                 assumed_n = manifest.contact_threshold_n
-            given.append((data.tared_counts, data.force))
+            sets.append(data)
             digests.add(data.content_sha256())  # of a mixed file, whose features were learned from
             rows = _rows_of_sensor(bundle, data, unit, path)
             inputs.append(data.tared_counts[rows])
@@ -253,6 +255,7 @@ def evaluate(folder: Path, paths: Sequence[Path], *, unit: str | None = None) ->
             parts.append(of(bundle, mixed, rows))
         about.append((provenance.source, digest))
         digests.add(digest)
+    refuse_same_presses(paths, sets)
     refuse_repeated(paths, given)
     errors = _joined(parts)
     known = bundle.known_inputs

@@ -27,6 +27,7 @@ from palpate_training.datasets.features import (
     of_sensor,
     open_dataset,
     press_of,
+    refuse_same_presses,
 )
 from palpate_training.learning.export import refuse_existing, version_of
 from palpate_training.learning.field_code import in_parts
@@ -153,6 +154,7 @@ def add_intervals(
         )
     sets = [read_held_out(bundle, path) for path in held_out]
     refuse_repeated(held_out, [(one.rows.tared, one.rows.force_n[:, None]) for one in sets])
+    refuse_same_presses(held_out, [one.data for one in sets if one.data is not None])
     found = joined([one.rows for one in sets])
     presses = len(np.unique(found.press))
     for path, one in zip(held_out, sets, strict=True):
@@ -190,11 +192,15 @@ def add_intervals(
 
 
 class ReadRows(NamedTuple):
-    """Rows of a data set as a bundle sees them, the set's digest (hex), and what it is."""
+    """Rows of a data set as a bundle sees them, the set's digest (hex), and what it is.
+
+    ``data`` are its features, for a bundle of features.
+    """
 
     rows: HeldOut
     sha256: str
     source: str
+    data: FeatureDataset | None = None
 
 
 def read_held_out(bundle: Bundle, path: Path) -> ReadRows:
@@ -202,11 +208,10 @@ def read_held_out(bundle: Bundle, path: Path) -> ReadRows:
     if bundle.manifest.task == "features":
         data, about, digest = read_features(path)
         rows = held_out_features(bundle, data)
-    else:
-        mixed = read_mixed(path)
-        about, digest = mixed.experiment.provenance, content_sha256(mixed)
-        rows = held_out_fields(bundle, mixed)
-    return ReadRows(rows, digest, f"{about.source} ({about.command})")
+        return ReadRows(rows, digest, f"{about.source} ({about.command})", data)
+    mixed = read_mixed(path)
+    about, digest = mixed.experiment.provenance, content_sha256(mixed)
+    return ReadRows(held_out_fields(bundle, mixed), digest, f"{about.source} ({about.command})")
 
 
 def joined(parts: Sequence[HeldOut]) -> HeldOut:
