@@ -15,7 +15,8 @@ from palpate.errors import DatasetError
 from palpate_training.cli import data_app
 from palpate_training.datasets.basis import fit_basis, subset
 from palpate_training.datasets.experiment import MixedDataset, read_mixed, write_mixed
-from palpate_training.datasets.features import FeatureDataset, joined
+from palpate_training.datasets.export import features
+from palpate_training.datasets.features import FeatureDataset, joined, open_dataset
 from palpate_training.datasets.join import join_files, join_mixed
 from palpate_training.datasets.shrink import SmallSize, shrink_file
 
@@ -97,7 +98,9 @@ def test_parts_that_do_not_fit_together_are_refused(large: MixedDataset, tmp_pat
         join_mixed([large, replace(large, experiment=own)], ["a", "b"], modes=2, force_modes=1)
 
     files = [tmp_path / folder / "mixed.h5" for folder in ("one", "two")]
-    unlike = replace(large.experiment, tared=large.experiment.tared * np.float32(1.1))
+    elsewhere = large.experiment.location + np.float32([0.0, 0.003, 0.0])
+    tared = large.experiment.tared * np.float32(1.1)
+    unlike = replace(large.experiment, tared=tared, location=elsewhere)
     for file, one in zip(files, (large, replace(large, experiment=unlike)), strict=True):
         file.parent.mkdir()
         write_mixed(file, one)
@@ -160,6 +163,27 @@ def test_features_with_the_same_rows_of_rest_are_joined(
         one.electrodes[100:200] = np.rint(data.baseline[0]).astype(np.uint16)
         one.force[100:200] = np.float32(0.001 * (1 + number))
     assert len(joined([data, other])) == 800
+
+
+def test_one_plan_on_two_specimens_is_held_out_together(
+    large: MixedDataset, tmp_path: Path
+) -> None:
+    """Also where each specimen has a file of its own."""
+    rows = replace(
+        large.experiment,
+        unit_names=tuple(f"other-{name}" for name in large.experiment.unit_names),
+        tared=large.experiment.tared * np.float32(1.1),
+        location=large.experiment.location + np.float32([0.0, 0.001, 0.0]),  # another robot
+    )
+    files = [tmp_path / "one.h5", tmp_path / "two.h5"]
+    for file, one in zip(files, (large, replace(large, experiment=rows)), strict=True):
+        write_mixed(file, one)
+    with pytest.raises(DatasetError, match="the same trajectories, pressed on different specimens"):
+        join_files(files, tmp_path / "both.h5", modes=2, force_modes=2, command="")
+    done = CliRunner().invoke(data_app, ["features", *map(str, files), str(tmp_path / "rows.h5")])
+    assert done.exit_code == 0, done.output
+    both, alone = open_dataset(tmp_path / "rows.h5"), features(large).group
+    np.testing.assert_array_equal(both.group, np.concatenate([alone, alone]))
 
 
 def test_a_part_and_what_it_is_of_are_not_joined(large: MixedDataset, tmp_path: Path) -> None:

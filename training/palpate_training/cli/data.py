@@ -37,7 +37,7 @@ from palpate_training.datasets.ingest import (
 )
 from palpate_training.datasets.inspect import ExperimentContents, load
 from palpate_training.datasets.inspect import contents as experiment_contents
-from palpate_training.datasets.join import join_files
+from palpate_training.datasets.join import PressStarts, join_files, press_starts, pressed_alike
 from palpate_training.datasets.lerobot import export_lerobot, read_lerobot
 from palpate_training.datasets.shrink import SMALL, SmallSize, shrink_file
 from palpate_training.datasets.tables import ColumnMap, dataset_of, export_table, read_table
@@ -250,15 +250,21 @@ def data_features(
 
     palpate data features twin.h5 twin-features.h5
     """
-    parts = []
+    parts, groups = [], []
+    plans: list[PressStarts] = []
     for path in paths:
         _, data = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
+        experiment = data.experiment if isinstance(data, MixedDataset) else data
+        # A plan may have been pressed on specimens whose files are apart.
+        plans.append(press_starts(experiment))
+        plan = next(n for n, other in enumerate(plans) if pressed_alike(plans[-1], other))
+        groups.append([f"{plan}/{name}" for name in experiment.trajectories])
         part = features(data, untouched_rows=untouched_rows, assumed_rest=assumed_rest)
         # Published files do not say what made them, so these rows begin here.
         made_by = part.provenance.command or typed_command()
         provenance = replace(part.provenance, command=made_by)
         parts.append(replace(part, name=str(path), provenance=provenance))
-    rows = parts[0] if len(parts) == 1 else joined(parts, command=typed_command())
+    rows = parts[0] if len(parts) == 1 else joined(parts, groups=groups, command=typed_command())
     write_dataset(out, rows)
     console.print(contents(rows, str(out)))
 

@@ -5,6 +5,7 @@ On disk: HDF5 schema ``palpate.features`` version 1, written whole or not at all
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -120,13 +121,20 @@ class FeatureDataset:
         return rows_sha256(self.sensor_names, self.arrays())
 
 
-def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureDataset:
+def joined(
+    parts: Sequence[FeatureDataset],
+    *,
+    groups: Sequence[Sequence[str]] | None = None,
+    command: str = "",
+) -> FeatureDataset:
     """Put data sets together; groups and blocks of different ones stay apart.
 
     Sensors of the same name are the same sensor.
 
     Args:
         parts: At least one, all with the same columns.
+        groups: What each group of each part is called, by its number: those of the same name are
+            one, and held out together. None = groups of different parts are different ones.
         command: For provenance.
 
     Raises:
@@ -144,13 +152,17 @@ def joined(parts: Sequence[FeatureDataset], *, command: str = "") -> FeatureData
     names = tuple(dict.fromkeys(name for part in parts for name in part.sensor_names))
     arrays: dict[str, list[npt.NDArray[np.generic]]] = {}
     first = {"group": 0, "block": 0}
-    for part in parts:
+    numbers: dict[str, int] = {}
+    for part, called in zip(parts, groups or itertools.repeat(None, len(parts)), strict=True):
         own = dict(part.arrays())
         own["sensor"] = np.array([names.index(name) for name in part.sensor_names])[part.sensor]
         for name in first:
             _, number = np.unique(own[name], return_inverse=True)
             own[name] = first[name] + number
             first[name] += int(number.max(initial=-1)) + 1
+        if called is not None:
+            number = np.array([numbers.setdefault(name, len(numbers)) for name in called])
+            own["group"] = number[part.group]
         for name, array in own.items():
             arrays.setdefault(name, []).append(array.astype(getattr(part, name).dtype))
     return FeatureDataset(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,8 +36,15 @@ from palpate_training.datasets.experiment import (
     write_mixed,
 )
 
+SAME_PRESS_M = 2e-3
+"""The tip of the indenter begins a press nearer than this on two specimens [m]: robots are off by a
+millimetre or so, and random points are further apart."""
+
 _ROWS = 256
 """Rows whose fields are in memory at once."""
+
+PressStarts = Mapping[str, tuple[str, FloatArray]]
+"""By trajectory: its indenter, and the tip where it begins [m], sensor frame, (3,)."""
 
 Fields = Sequence[tuple[FieldBasis, FloatArray]]
 """Bases, each with the coefficients (N, K) of the rows that it holds."""
@@ -52,7 +59,8 @@ def join_files(
 
     Raises:
         DatasetError: A file is missing, damaged or no mixed data set, ``out`` exists, two parts
-            have the same name or hold the same presses, the disk refuses, or as in ``join_mixed``.
+            have the same name or hold the same presses or trajectories, the disk refuses, or as in
+            ``join_mixed``.
     """
     if out.exists():
         raise DatasetError(f"{out} exists", remedy="remove it, or give another name")
@@ -66,6 +74,14 @@ def join_files(
         )
     parts = [read_mixed(path) for path in paths]
     refuse_repeated(paths, [(part.experiment.tared, part.experiment.force) for part in parts])
+    starts = [press_starts(part.experiment) for part in parts]
+    for (a, one), (b, other) in itertools.combinations(zip(paths, starts, strict=True), 2):
+        if pressed_alike(one, other):
+            raise DatasetError(
+                f"{a} and {b} hold the same trajectories, pressed on different specimens",
+                remedy="make one data set of all specimens: joined, a trajectory would be learned "
+                "from on one and tested on another",
+            )
     joined = join_mixed(
         parts,
         names,
@@ -152,6 +168,29 @@ def join_mixed(
 def _largest_losses(bases: Sequence[FieldBasis], what: str) -> str:
     mean, most = max(one.loss_mean for one in bases), max(one.loss_max for one in bases)
     return f"{mean:.3g} {what} on average, {most:.3g} at most"
+
+
+def press_starts(data: ExperimentDataset) -> PressStarts:
+    """Where each trajectory begins, by the first trial of it."""
+    numbers, trial = np.unique(data.trial_trajectory, return_index=True)
+    tips = data.location[np.searchsorted(data.trial, trial)]
+    return {
+        data.trajectories[number]: (data.indenters[number], tip)
+        for number, tip in zip(numbers, tips, strict=True)
+    }
+
+
+def pressed_alike(one: PressStarts, other: PressStarts) -> bool:
+    """Whether the trajectories that two experiments both name are the same presses.
+
+    So it is where one plan was pressed on specimens whose files are apart. Other plans give the
+    same names to other indenters, or to other points.
+    """
+    names = one.keys() & other.keys()
+    if not names or any(one[name][0] != other[name][0] for name in names):
+        return False
+    apart = [float(np.linalg.norm(one[name][1] - other[name][1])) for name in names]
+    return float(np.median(apart)) < SAME_PRESS_M
 
 
 def join_experiments(
