@@ -214,7 +214,8 @@ def _align(
         _log.warning(
             "%s: %s; if nothing touched at times, the force/torque sensor was not zeroed, and every"
             " force is wrong by as much",
-            *(path, never),
+            path,
+            never,
         )
     _log.info("%s: %d of %d frames of %s kept", path, kept.sum(), len(streams.frames), name)
 

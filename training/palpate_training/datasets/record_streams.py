@@ -158,7 +158,11 @@ def force_at(
     if overloaded := int(np.count_nonzero(aligned & ~known)):
         _log.warning(
             "%s: %d of %d frames of %s are left out: %s",
-            *(path, overloaded, len(times), name, OVERLOAD),
+            path,
+            overloaded,
+            len(times),
+            name,
+            OVERLOAD,
         )
     return force, known, overloaded
 
