@@ -88,7 +88,7 @@ def linear(
         at_ns: When [ns], of any shape.
         times_ns: When the values were taken [ns], shape ``(N,)``, in any order.
         values: Shape ``(N, K)``.
-        period_s: Of the stream [s]; None = the median of its gaps.
+        period_s: Of the stream [s]; None = the median of its gaps, without those of 0.
 
     Returns:
         Values of shape ``(*at_ns.shape, K)``, NaN where unknown; and a mask of the known ones.
@@ -147,9 +147,11 @@ class _Around:
 def longest_gap_ns(times_ns: Times, period_s: float | None = None) -> float:
     """How far apart two readings may be for a value between them [ns]; times in order.
 
-    The period of the stream [s] may be given; None = the median of its gaps.
+    The period of the stream [s] may be given; None = the median of its gaps. Readings that arrive
+    together and share a time have no gap between them.
     """
     if period_s is None:
         steps = np.diff(times_ns)
+        steps = steps[steps > 0]
         return GAP_PERIODS * float(np.median(steps)) if len(steps) else 0.0
     return GAP_PERIODS * 1e9 * period_s

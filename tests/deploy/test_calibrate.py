@@ -25,10 +25,19 @@ from rich.console import Console
 import palpate_training
 from palpate.admin import make_token, token_file
 from palpate.bus import Delivery, Session
-from palpate.bus.topics import FEATURES, WRENCH
+from palpate.bus.topics import ELECTRODES, FEATURES, WRENCH
 from palpate.config import LinkConfig
-from palpate.errors import BundleError, ConfigError, LinkError, RecordingError, StreamTimeout
+from palpate.errors import (
+    BundleError,
+    ConfigError,
+    DatasetError,
+    LinkError,
+    RecordingError,
+    StreamTimeout,
+)
 from palpate.files.bundle import read_bundle, write_bundle
+from palpate.files.record import read_record
+from palpate.files.record_writer import RecordWriter
 from palpate.health import Health
 from palpate.messages import NO_TARE, QualityFlag, ServiceState
 from palpate_deploy.station import calibrate, guided_presses
@@ -53,6 +62,8 @@ SAMPLE = Path(palpate_training.__file__).parent / "samples" / "twin.h5"
         (["--presses", "0"], "name presses of other fingers"),
         (["--presses", "5"], "too few to hold some of them out"),
         (["--presses", "0", "--from", "FILE", "--others", "FILE"], "exclude each other"),
+        (["--presses", "50", "--from", "FILE"], "--presses and --from exclude each other"),
+        (["--out", "FILE", "--from", "FILE"], "--out and --from exclude each other"),
         (["--from", "FILE", "--others", "FILE"], "a file is named twice"),
         (["--presses", "0", "--others", "FILE", "--others", "FILE"], "a file is named twice"),
         (["--others", "missing.h5"], "missing.h5"),
@@ -122,10 +133,18 @@ def test_the_table_says_that_it_counts_what_was_recorded() -> None:
 
 
 class Streams:
-    """A session whose force presses for a second out of two, ``presses`` times."""
+    """A session whose force presses for a second out of two, ``presses`` times.
 
-    def __init__(self, presses: int, frames: Callable[[], SimpleNamespace | None]) -> None:
-        self._presses, self._frames = presses, frames
+    Its force/torque sensor is overloaded at ``overload_n``.
+    """
+
+    def __init__(
+        self,
+        presses: int,
+        frames: Callable[[], SimpleNamespace | None],
+        overload_n: float = np.inf,
+    ) -> None:
+        self._presses, self._frames, self._overload_n = presses, frames, overload_n
 
     @contextlib.contextmanager
     def subscriber(self, topic: object, **_: object) -> Iterator[SimpleNamespace]:
@@ -134,7 +153,8 @@ class Streams:
 
         def wrench() -> SimpleNamespace:
             stamp = SimpleNamespace(monotonic_ns=1e9 * next(times_s))
-            return SimpleNamespace(force=np.array([0.0, 0.0, next(forces)]), stamp=stamp)
+            force = np.array([0.0, 0.0, next(forces)])
+            return SimpleNamespace(force=force, stamp=stamp, overload=force[2] >= self._overload_n)
 
         make = wrench if topic is WRENCH else self._frames
 
@@ -145,14 +165,14 @@ class Streams:
         yield SimpleNamespace(next_batch=next_batch)
 
 
-def guide(streams: Streams, presses: int) -> int:
+def guide(streams: Streams, presses: int, console: Console | None = None) -> int:
     return guided_presses._guide(
         streams,  # type: ignore[arg-type]
         "finger",
         presses,
         Path("rec"),
         threading.Event(),
-        Console(quiet=True),
+        console or Console(quiet=True),
         check=lambda: None,
     )
 
@@ -160,6 +180,16 @@ def guide(streams: Streams, presses: int) -> int:
 def test_presses_are_counted_while_electrodes_come() -> None:
     frame = SimpleNamespace(electrodes_valid=True, tare_id=1)
     assert guide(Streams(7, lambda: frame), 7) == 7
+
+
+def test_an_overload_is_told_while_it_is_pressed() -> None:
+    """Once a press, not once a reading."""
+    frame = SimpleNamespace(electrodes_valid=True, tare_id=1)
+    told = "the force/torque sensor is overloaded: press more gently; such readings are not learned"
+    for overload_n, times in ((np.inf, 0), (2.0, 3)):
+        said = Console(file=io.StringIO(), width=200)
+        assert guide(Streams(3, lambda: frame, overload_n), 3, said) == 3
+        assert said.file.getvalue().count(told) == times  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
@@ -343,6 +373,27 @@ def test_nobody_presses_for_a_bundle_that_cannot_be_kept_or_served(
     order = calibrate.CalibrationOrder("finger", 7, tmp_path / "rec", None, "", serve=serve)
     with pytest.raises((ConfigError, LinkError), match=problem):
         calibrate.calibrate_finger(link, "lab", order, token=None, profile=None, as_json=True)
+
+
+def test_two_fingers_in_one_record_are_not_learned_from(
+    virtual_record: Path, tmp_path: Path
+) -> None:
+    """The second half is of another one."""
+    exchanged = tmp_path / "lab.mcap"
+    with RecordWriter(exchanged) as writer:
+        for item in read_record(virtual_record):
+            payload = item.payload
+            if item.address.topic == ELECTRODES.name:
+                frame = ELECTRODES.codec.decode(payload)
+                if frame.stamp.sequence > 150:
+                    frame = replace(frame, sensor_serial="BT-7")
+                payload = ELECTRODES.codec.encode(frame)
+            writer.write(item.key, item.schema, payload, log_time_ns=item.log_time_ns)
+    order = calibrate.CalibrationOrder("virtual-finger", None, None, exchanged, "", serve=False)
+    with pytest.raises(DatasetError, match="is 2 fingers, exchanged while it was recorded: BT-7, "):
+        calibrate.calibrate_finger(
+            LinkConfig(), "lab", order, token=None, profile=None, as_json=True
+        )
 
 
 def test_a_version_that_another_takes_meanwhile_is_left_to_it(

@@ -97,6 +97,16 @@ def test_one_reading_is_known_at_its_own_time_only() -> None:
     assert longest_gap_ns(np.array([5])) == 0.0
 
 
+def test_readings_that_arrive_together_have_no_gap_between_them() -> None:
+    """Three with one stamp, every 3 ms: most steps are 0."""
+    times_ns = np.repeat(np.arange(20, dtype=np.int64) * 3 * MS, 3)
+    value, known = linear(np.array([4 * MS]), times_ns, times_ns[:, None] / MS)
+    assert known.all()
+    assert value[0, 0] == pytest.approx(4.0)
+    assert longest_gap_ns(times_ns) == 9 * MS
+    assert longest_gap_ns(np.array([5, 5])) == 0.0
+
+
 def test_orientations_turn_evenly_along_the_shorter_arc() -> None:
     def about_z(angle: float) -> list[float]:
         return [np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]

@@ -232,6 +232,24 @@ def test_few_presses_are_refused(press_data: MakeData, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_force_that_was_not_zeroed_is_not_blamed_on_the_presses(press_data: MakeData) -> None:
+    """Without a pose all is one touch, and one press."""
+    data = press_data(presses=8)
+    one = replace(
+        data,
+        force=data.force + np.array([0, 0, 1.5], np.float32),
+        group=np.zeros(len(data), np.int32),
+        block=np.zeros(len(data), np.int32),
+        in_contact=np.ones(len(data), np.bool_),
+        contact_location=None,
+        centre_of_pressure=None,
+        contact_normal=None,
+    )
+    with pytest.raises(DatasetError, match=r"1 presses .*; the force is never below 1\.") as told:
+        known_rows(one)
+    assert told.value.remedy.startswith("zero the force/torque sensor while nothing touches")
+
+
 def test_two_fingers_are_refused(press_data: MakeData, tmp_path: Path) -> None:
     data = press_data(presses=8)
     two = replace(data, sensor=(data.group >= 4).astype(np.int32), sensor_names=("one", "two"))

@@ -191,12 +191,14 @@ def test_record_aligns_and_numbers_presses(record: Record) -> None:
     touches = [20 <= i < 40 or 60 <= i < 80 for i in range(100)]
     record.add(TARE, tare(1, 2000.0))
     record.add(ELECTRODES, *(frame(i + 1) for i in range(100)))
-    record.add(WRENCH, *(wrench(i + 1, offset_ns=-4_000_000) for i in range(101)))
+    wrenches = [wrench(i + 1, offset_ns=-4_000_000) for i in range(101)]
+    # 1 mN a frame: nothing that would contradict the poses
+    record.add(WRENCH, *(replace(one, force=1e-3 * one.force) for one in wrenches))
     record.add(POSE, *(pose(i + 1, touches=touches[i]) for i in range(100)))
     data = ingest_record(record.write())
     assert len(data) == 100
     # wrenches come 4 ms before the frames: the value between two of them is the frame's own
-    np.testing.assert_allclose(data.force[:, 2], np.arange(1, 101), atol=1e-4)
+    np.testing.assert_allclose(data.force[:, 2], 1e-3 * np.arange(1, 101), atol=1e-7)
     np.testing.assert_allclose(data.tared_counts[:, 0], np.arange(1, 101))
     assert data.in_contact is not None
     assert data.contact_location is not None
@@ -286,7 +288,7 @@ def test_messages_that_break_the_contract_are_left_out_and_told(
 ) -> None:
     record.add(TARE, tare(1, 2000.0)).add(ELECTRODES, *(frame(i) for i in range(1, 51)))
     record.add(WRENCH, *(wrench(i) for i in range(1, 51)))
-    record.add(POSE, *(pose(i, touches=i > 20) for i in range(1, 51)))
+    record.add(POSE, *(pose(i, touches=True) for i in range(1, 51)))
     path = record.write()
     whole = ingest_record(path)
     spoilt = path.with_name("spoilt.mcap")
@@ -401,3 +403,109 @@ def test_a_contact_that_a_pose_tells_is_a_press_however_light(record: Record) ->
     record.add(WRENCH, *(replace(wrench(i), force=np.full(3, 0.01, "f4")) for i in range(1, 32)))
     record.add(POSE, *(pose(i, touches=i % 10 < 5) for i in range(1, 32)))
     assert len(np.unique(ingest_record(record.write()).group)) == 4
+
+
+def presses(*, rest_n: float = 0.0, most_n: float = np.inf) -> list[WrenchFrame]:
+    """Two presses of 5 N in 100 readings, of a sensor that clips at ``most_n`` and says so."""
+    made = []
+    for i in range(1, 101):
+        size = min(rest_n + 5.0 * (i % 50 >= 25), most_n)
+        force = np.array([0.0, 0.0, size], np.float32)
+        made.append(replace(wrench(i), force=force, overload=size == most_n))
+    return made
+
+
+def add_finger(record: Record, name: str, wrenches: list[WrenchFrame], serial: str = "s1") -> None:
+    record.add(TARE, tare(1, 2000.0), of=name)
+    frames = (replace(frame(i), sensor_serial=serial) for i in range(1, 101))
+    record.add(ELECTRODES, *frames, of=name)
+    record.add(WRENCH, *wrenches, of=name)
+
+
+def test_what_an_overloaded_sensor_says_is_no_truth(
+    record: Record, caplog: pytest.LogCaptureFixture
+) -> None:
+    add_finger(record, "finger", presses(most_n=3.0))
+    data = ingest_record(record.write())
+    # Of 100 rows 50 are pressed.
+    assert len(data) == 50
+    assert not data.force.any()
+    told = "50 rows of finger left out: the force/torque sensor was overloaded"
+    assert told in data.provenance.notes
+    assert "50 of 100 frames of finger are left out: the force/torque sensor was" in caplog.text
+
+
+def test_between_a_good_reading_and_an_overloaded_one_the_force_is_unknown(record: Record) -> None:
+    record.add(TARE, tare(1, 2000.0)).add(ELECTRODES, *(frame(i) for i in range(1, 11)))
+    wrenches = [wrench(i, offset_ns=-4_000_000) for i in range(1, 12)]
+    wrenches[5] = replace(wrenches[5], overload=True)  # between frames 5 and 6
+    data = ingest_record(record.add(WRENCH, *wrenches).write())
+    np.testing.assert_array_equal(data.electrodes[:, 0] - 2000, [1, 2, 3, 4, 7, 8, 9, 10])
+
+
+def test_a_record_of_overload_alone_is_not_blamed_on_clocks(record: Record) -> None:
+    add_finger(record, "finger", presses(rest_n=3.0, most_n=3.0))
+    with pytest.raises(
+        DatasetError, match="100 in which the force/torque sensor was overl"
+    ) as told:
+        ingest_record(record.write())
+    assert told.value.remedy == "press more gently"
+
+
+def test_two_fingers_are_not_taken_for_one(record: Record) -> None:
+    record.add(TARE, tare(1, 2000.0))
+    frames = [frame(i) for i in range(1, 11)]
+    record.add(ELECTRODES, *frames[:3], *(replace(f, sensor_serial="s2") for f in frames[3:]))
+    record.add(WRENCH, *(wrench(i) for i in range(1, 11)))
+    with pytest.raises(DatasetError, match=r"'finger' is 2 fingers, .*: s1, s2") as told:
+        ingest_record(record.write())
+    assert "a record of its own of each finger" in told.value.remedy
+
+
+def test_serial_numbers_are_kept_with_the_rows(record: Record) -> None:
+    add_finger(record, "finger", presses(), serial="BT-1")
+    add_finger(record, "thumb", presses(), serial="BT-2")
+    notes = ingest_record(record.write()).provenance.notes
+    assert "serial number of finger: BT-1" in notes
+    assert "serial number of thumb: BT-2" in notes
+
+
+def test_fingers_of_a_record_can_be_chosen(record: Record) -> None:
+    """One that has no force/torque sensor does not hold up the others."""
+    for name, wrenches in (("index", presses()), ("little", []), ("thumb", presses())):
+        add_finger(record, name, wrenches)
+    path = record.write()
+    with pytest.raises(DatasetError, match="'little' has no wrench stream") as told:
+        ingest_record(path)
+    assert "palpate data ingest-record --sensor index --sensor thumb" in told.value.remedy
+    assert ingest_record(path, sensors=["thumb", "index"]).sensor_names == ("index", "thumb")
+    with pytest.raises(DatasetError, match="no sensor 'ring'") as told:
+        ingest_record(path, sensors=["index", "ring"])
+    assert told.value.remedy == "it holds: index, little, thumb"
+
+
+def test_a_force_where_a_pose_knows_of_no_contact_is_refused(record: Record) -> None:
+    """The force/torque sensor was not zeroed; or the pose is wrong."""
+    add_finger(record, "finger", presses(rest_n=1.5))
+    record.add(POSE, *(pose(i, touches=i % 50 >= 25) for i in range(1, 101)))
+    with pytest.raises(
+        DatasetError, match=r"force on 'finger' is 1\.50 N in the 50 frames"
+    ) as told:
+        ingest_record(record.write())
+    assert "palpate tare NAME" in told.value.remedy
+
+
+def test_a_force_that_never_ends_is_told(record: Record, caplog: pytest.LogCaptureFixture) -> None:
+    """A finger may be touched all the time; but most often the sensor was not zeroed."""
+    add_finger(record, "finger", presses(rest_n=1.5))
+    data = ingest_record(record.write())
+    assert "the force on finger is never below 1.50 N" in data.provenance.notes
+    assert "the force/torque sensor was not zeroed" in caplog.text
+
+
+def test_readings_that_share_a_stamp_are_aligned(record: Record) -> None:
+    """As where three arrive in one packet, every 20 ms."""
+    record.add(TARE, tare(1, 2000.0)).add(ELECTRODES, *(frame(i) for i in range(1, 21)))
+    record.add(WRENCH, *(wrench(i) for i in range(1, 23, 2) for _ in range(3)))
+    data = ingest_record(record.write())
+    np.testing.assert_allclose(data.force[:, 2], np.arange(1, 21), atol=1e-4)

@@ -44,6 +44,18 @@ def cut_end_of(name: str, increment: int) -> Callable[[Streams], None]:
     return change
 
 
+def overload_end_of(increment: int) -> Callable[[Streams], None]:
+    """The force/torque sensor is overloaded in the second half of an increment."""
+
+    def change(streams: Streams) -> None:
+        end = START_NS + increment * 5_000_000_000
+        for i, one in enumerate(wrenches := streams[WRENCH.name]):
+            if isinstance(one, WrenchFrame) and end - 2_500_000_000 < one.stamp.wall_ns < end:
+                wrenches[i] = replace(one, overload=True)
+
+    return change
+
+
 def cut_start_of(name: str) -> Callable[[Streams], None]:
     def change(streams: Streams) -> None:
         streams[name][:] = [m for m in streams[name] if m.stamp.wall_ns > START_NS + 10**9]
@@ -92,6 +104,7 @@ def exchange(streams: Streams) -> None:
         (exchange, "1 of [0-9]+ frames of 'finger' are of a BIOTAC_SP with 24 electrodes"),
         (cut_end_of(ELECTRODES.name, 4), "'s/00/normal': no sample.*increment 4;"),
         (cut_end_of(WRENCH.name, 4), "'s/00/normal': no sample.*increment 4;"),
+        (overload_end_of(4), "'s/00/normal': no sample.*increment 4;.*without an overload"),
         (cut_end_of(POSE.name, 1), "'s/00/normal': no sample.*increment 1;"),
         (cut_start_of(WRENCH.name), "'s/00/normal': no sample.* in its first"),
         (move_tip(0, -0.25e-3), "at the start the tip is 0.2"),

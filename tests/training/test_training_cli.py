@@ -81,6 +81,28 @@ def test_inspect_tells_a_sensor_by_its_whole_name(
         assert word in result.output
 
 
+@pytest.mark.filterwarnings("error")
+def test_inspect_of_rows_that_nothing_touches(press_data: MakeData, tmp_path: Path) -> None:
+    data = press_data()
+    nowhere = np.full((len(data), 3), np.nan, np.float32)
+    write_dataset(
+        tmp_path / "p.h5",
+        replace(
+            data,
+            contact_location=nowhere,
+            centre_of_pressure=None,
+            contact_normal=None,
+            in_contact=np.zeros(len(data), np.bool_),
+        ),
+    )
+    result = CliRunner().invoke(
+        data_app, ["inspect", str(tmp_path / "p.h5")], env={"COLUMNS": "200"}
+    )
+    assert result.exit_code == 0, result.output
+    (line,) = [line for line in result.output.splitlines() if "contact_location" in line]
+    assert [cell.strip() for cell in line.split("│")][-4:-1] == ["-", "-", "-"]
+
+
 def test_inspect_names_every_schema_that_it_knows(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file.attrs["schema"] = "something.else"

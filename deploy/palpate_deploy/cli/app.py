@@ -219,9 +219,13 @@ def tare(
 def calibrate(
     sensor: Annotated[str, typer.Argument(help="Name of the finger.")] = "finger",
     presses: Annotated[
-        int,
-        typer.Option(min=0, help="Presses to record: 6 or more; 0 = none: only --others are used."),
-    ] = 20,
+        int | None,
+        typer.Option(
+            min=0,
+            help="Presses to record: 6 or more; 0 = none: only --others are used.",
+            show_default="20",
+        ),
+    ] = None,
     source: Annotated[
         Path | None,
         typer.Option(
@@ -238,7 +242,9 @@ def calibrate(
             " help a finger that is like them, most where it has few presses of its own.",
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the record.")] = Path("runs/calibrate"),
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the record.", show_default="runs/calibrate")
+    ] = None,
     name: Annotated[str, typer.Option(help="Name of the bundle; default: features-SERIAL.")] = "",
     serve: Annotated[
         bool | None,

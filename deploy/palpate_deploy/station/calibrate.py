@@ -45,14 +45,22 @@ PRESSES_LEAST = 6
 """Fewer cannot be held out and chosen on at once; as ``tasks.finger`` says, which needs torch."""
 
 
+PRESSES = 20
+"""How many are recorded where nobody says."""
+
+FOLDER = Path("runs/calibrate")
+"""Where they are recorded to where nobody says."""
+
+
 @dataclass(frozen=True, slots=True)
 class CalibrationOrder:
     """What ``palpate calibrate`` is to do.
 
     Attributes:
         sensor: Name of the finger at the station, or in the file.
-        presses: How many presses to record; 0 = the finger is not pressed, others tell of it.
-        out: Folder of the record.
+        presses: How many presses to record; 0 = the finger is not pressed, others tell of it; None
+            = ``PRESSES``.
+        out: Folder of the record; None = ``FOLDER``.
         source: A record or data set to learn from, instead of recording one.
         name: Of the bundle; empty = by the serial number.
         serve: Whether the station serves the bundle for this finger afterwards.
@@ -60,25 +68,27 @@ class CalibrationOrder:
     """
 
     sensor: str
-    presses: int
-    out: Path
+    presses: int | None
+    out: Path | None
     source: Path | None
     name: str
     serve: bool
     others: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.presses == 0 and self.source is not None:
-            raise ConfigError(
-                "--presses 0 and --from exclude each other: a record has presses",
-                remedy="leave one of the two out",
-            )
+        for option, given in (("--presses", self.presses), ("--out", self.out)):
+            if given is not None and self.source is not None:
+                raise ConfigError(
+                    f"{option} and --from exclude each other: nothing is recorded, and all presses"
+                    " of the file are learned from",
+                    remedy="leave one of the two out",
+                )
         if self.presses == 0 and not self.others:
             raise ConfigError(
                 "without presses nothing is known of the finger",
                 remedy="name presses of other fingers: --others FILE; or press this one",
             )
-        if 0 < self.presses < PRESSES_LEAST:
+        if self.presses is not None and 0 < self.presses < PRESSES_LEAST:
             raise ConfigError(
                 f"{self.presses} presses are too few to hold some of them out",
                 remedy=f"--presses {PRESSES_LEAST} or more; 0 with --others",
@@ -186,15 +196,17 @@ def calibrate_finger(
         _check_not_shipped(order.name)
     others = _Others.read(order.others)
     secret = b""
-    if order.presses and order.source is None:
-        _check_writable(order.out)
+    presses = PRESSES if order.presses is None else order.presses
+    out = FOLDER if order.out is None else order.out
+    if presses and order.source is None:
+        _check_writable(out)
     check_folder(kept.repository_folder, "[models] folder")
     if order.serve:
         secret = read_token(token_file(kept.memory_folder, station) if token is None else token)
         with Session.open(link, station=station) as session:
             ModelAdmin(session, secret).served("features")
     source = order.source
-    if order.presses == 0:
+    if presses == 0:
         tare = untouched(link, station, order.sensor, console)
         others.check(tare.sensor_serial)
         serials = [tare.sensor_serial] if tare.sensor_serial else []
@@ -208,7 +220,7 @@ def calibrate_finger(
         live = ""
         if source is None:
             source, live = record_presses(
-                *(link, station, order.sensor, order.presses, order.out, console),
+                *(link, station, order.sensor, presses, out, console),
                 least=PRESSES_LEAST,
                 check=others.check,
             )
@@ -258,7 +270,8 @@ def calibrate_finger(
 def _rows(source: Path, sensor: str | None = None) -> tuple[FeatureDataset, list[str]]:
     """Rows of a record or data set, of one finger or all; serial numbers where they are known."""
     from palpate_training.datasets.features import of_sensor, open_dataset
-    from palpate_training.datasets.ingest import read_streams, rows_of_streams
+    from palpate_training.datasets.ingest import rows_of_streams
+    from palpate_training.datasets.record_streams import read_streams, serials_of
 
     def check(held: Collection[str]) -> None:
         if sensor is not None and sensor not in held:
@@ -279,8 +292,8 @@ def _rows(source: Path, sensor: str | None = None) -> tuple[FeatureDataset, list
     check(streams)
     if sensor is not None:
         streams = {sensor: streams[sensor]}
-    frames = (frame for each in streams.values() for frame in each.frames)
-    return rows_of_streams(source, streams), sorted({f.sensor_serial for f in frames} - {""})
+    serials = {serial for each in streams.values() for serial in serials_of(each)}
+    return rows_of_streams(source, streams), sorted(serials)
 
 
 def _check_writable(folder: Path) -> None:

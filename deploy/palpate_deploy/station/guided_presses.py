@@ -293,6 +293,9 @@ def _recording(link: LinkConfig, station: str, sensor: str, out: Path) -> Iterat
         recording.close()
 
 
+_OVERLOADED = "the force/torque sensor is overloaded: press more gently"
+
+
 def _guide(
     session: Session,
     sensor: str,
@@ -313,6 +316,7 @@ def _guide(
         TextColumn("press"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}")
     )
     task = bar.add_task("", total=presses)
+    told = False
     lines_s = seen_s = time.monotonic()
     remedy = f"see palpate status; {out} keeps what was recorded, for --from"
     with (
@@ -336,6 +340,10 @@ def _guide(
                     f"no valid, tared electrodes of {sensor!r} came for {_SEEN_S:g} s",
                     remedy=remedy,
                 )
+            overloaded = any(received.message.overload for received in batch)
+            if overloaded and not told:
+                console.print(f"{_OVERLOADED}; such readings are not learned from", markup=False)
+            told = overloaded or (told and counter.pressed)
             for received in batch:
                 wrench = received.message
                 force_n = float(np.linalg.norm(wrench.force))
@@ -346,7 +354,7 @@ def _guide(
                             f"press {counter.count} of {presses}: {counter.largest_n:.1f} N",
                             markup=False,
                         )
-            what = "let go" if counter.pressed else hint
+            what = _OVERLOADED if overloaded else "let go" if counter.pressed else hint
             bar.update(task, completed=counter.count, description=f"{force_n:5.2f} N   {what}")
             if not console.is_terminal and time.monotonic() >= lines_s:
                 lines_s = time.monotonic() + _LINE_S

@@ -96,6 +96,10 @@ def data_ingest_lasa(
 def data_ingest_record(
     source: Annotated[Path, typer.Argument(help="Record (.mcap) with electrodes, tare, wrench.")],
     out: Annotated[Path, typer.Argument(help="Data set to write (.h5).")],
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(help="Name of a finger; may be repeated; none = all in the record."),
+    ] = None,
     licence: Annotated[
         str, typer.Option(help="What may be done with the rows; kept with them.")
     ] = "own record",
@@ -105,7 +109,7 @@ def data_ingest_record(
     palpate data ingest-record presses.mcap presses.h5
     """
     with console.status(Text(f"reading {source.name}")):
-        data = ingest_record(source, command=typed_command(), licence=licence)
+        data = ingest_record(source, sensors=sensor or (), command=typed_command(), licence=licence)
         write_dataset(out, data)
     console.print(contents(data, str(out)))
 
@@ -408,13 +412,15 @@ def contents(data: FeatureDataset, title: str) -> Table:
     table = new_table(title, lines, *columns)
     for name, array in data.arrays().items():
         values = array.astype(np.float64)
-        low, middle, high = np.nanpercentile(values, [0, 50, 100])
+        # Where nothing ever touches, no contact location is known.
+        known = not np.isnan(values).all()
+        told = [f"{value:.6g}" for value in np.nanpercentile(values, [0, 50, 100])] if known else []
         table.add_row(
             name,
             str(array.dtype),
             str(array.shape),
             FEATURE_COLUMNS[name].unit,
-            *(f"{value:.6g}" for value in (low, middle, high)),
+            *(told or ("-", "-", "-")),
         )
     return table
 

@@ -18,8 +18,7 @@ from __future__ import annotations
 import itertools
 import logging
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +26,9 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate import __version__
-from palpate.alignment import AlignmentClock, Stamped, common_clock, linear, times_of
-from palpate.bus import topics
-from palpate.errors import DatasetError, WireError
-from palpate.files.record import read_record
-from palpate.messages import (
-    NO_TARE,
-    ElectrodeFrame,
-    IndenterPoseFrame,
-    SensorType,
-    Tare,
-    WrenchFrame,
-)
-from palpate.sampling import sample_offsets
+from palpate.alignment import linear, times_of
+from palpate.errors import DatasetError
+from palpate.messages import NO_TARE
 from palpate_training.datasets.container import Provenance, read_archive, sha256_of
 from palpate_training.datasets.features import (
     ELECTRODES,
@@ -47,6 +36,15 @@ from palpate_training.datasets.features import (
     check_counts,
     check_forces,
     cut_into_blocks,
+)
+from palpate_training.datasets.record_streams import (
+    OVERLOAD,
+    SensorStreams,
+    check_streams,
+    force_at,
+    middles,
+    read_streams,
+    serials_of,
 )
 
 _log = logging.getLogger(__name__)
@@ -58,49 +56,45 @@ TOUCH_N = 0.2
 PRESS_N = 0.5
 """What does not reach this force is no press [N]."""
 
-_STREAMS: Mapping[str, topics.Topic[Any]] = {
-    topic.name: topic for topic in (topics.ELECTRODES, topics.WRENCH, topics.POSE, topics.TARE)
-}
 
-Times = npt.NDArray[np.int64]
-Values = npt.NDArray[np.float64]
-
-
-@dataclass(slots=True)
-class SensorStreams:
-    """What a record holds of one sensor."""
-
-    frames: list[ElectrodeFrame] = field(default_factory=list)
-    wrenches: list[WrenchFrame] = field(default_factory=list)
-    poses: list[IndenterPoseFrame] = field(default_factory=list)
-    tares: dict[int, Tare] = field(default_factory=dict)
-
-    @property
-    def clock(self) -> AlignmentClock:
-        """By which all its messages can be compared."""
-        return common_clock(self.frames, self.wrenches, self.poses)
-
-
-def ingest_record(path: Path, *, command: str = "", licence: str = "own record") -> FeatureDataset:
+def ingest_record(
+    path: Path,
+    *,
+    sensors: Collection[str] = (),
+    command: str = "",
+    licence: str = "own record",
+) -> FeatureDataset:
     """Read an MCAP record.
 
     A row is a valid, tared electrode frame in whose middle there is a wrench (and a pose, where the
-    record has poses of that sensor): between two readings that are at most three periods apart. A
-    group is a press: it ends halfway between two contacts.
+    record has poses of that sensor): between two readings that are at most three periods apart, and
+    in neither of which the force/torque sensor was overloaded. A group is a press: it ends halfway
+    between two contacts.
     Where the source of the poses cannot know whether it touches, a force above ``TOUCH_N`` counts
     as contact, and as a press of its own only what reaches ``PRESS_N``.
 
     Args:
         path: ``NAME.mcap``.
+        sensors: Names of the fingers to read; none = all.
         command: The command line, for provenance.
         licence: What may be done with the rows.
 
     Raises:
         RecordingError: Not a whole record.
-        DatasetError: The record lacks a stream, no row could be aligned, a sensor is no BioTac with
-            19 electrodes, or its clock goes back.
+        DatasetError: The record lacks a finger or a stream, no row could be aligned, a sensor is no
+            BioTac with 19 electrodes, was exchanged for another, or its clock goes back; or there
+            is a force where the pose says that nothing touches.
     """
-    return rows_of_streams(path, read_streams(path), command=command, licence=licence)
+    streams = read_streams(path)
+    for name in sensors:
+        if name not in streams:
+            raise DatasetError(
+                f"{path} holds no sensor {name!r}",
+                remedy=f"it holds: {', '.join(sorted(streams)) or 'none'}",
+            )
+    if sensors:
+        streams = {name: streams[name] for name in sensors}
+    return rows_of_streams(path, streams, command=command, licence=licence)
 
 
 def rows_of_streams(
@@ -112,27 +106,35 @@ def rows_of_streams(
 ) -> FeatureDataset:
     """As ``ingest_record``, of streams that were read already, or of some of them."""
     parts: list[dict[str, npt.NDArray[Any]]] = []
-    names: list[str] = []
-    for name, streams in sorted(sensors.items()):
-        if not streams.frames:
-            continue
-        part = _align(path, name, streams)
-        part["sensor"] = np.full(len(part["group"]), len(names), dtype=np.int32)
+    notes = ["wrench and pose at the middle of each frame; group = press"]
+    fingers = {name: streams for name, streams in sorted(sensors.items()) if streams.frames}
+    names = list(fingers)
+    for name, streams in fingers.items():
+        try:
+            part = _align(path, name, streams, notes)
+        except DatasetError as error:
+            rest = [f"--sensor {one}" for one in names if one != name and fingers[one].wrenches]
+            if not rest:
+                raise
+            raise DatasetError(
+                error.problem,
+                remedy=f"{error.remedy}; or read the others alone: palpate data ingest-record "
+                + " ".join(rest),
+            ) from error
+        part["sensor"] = np.full(len(part["group"]), len(parts), dtype=np.int32)
         if parts:
             part["group"] = part["group"] + np.int32(parts[-1]["group"].max() + 1)
         parts.append(part)
-        names.append(name)
     if not parts:
         raise DatasetError(
             f"{path}: no electrode frames", remedy="record the stream electrodes of a sensor"
         )
-    notes = "wrench and pose at the middle of each frame; group = press"
     without = [
         name for name, part in zip(names, parts, strict=True) if "contact_location" not in part
     ]
     if without:
         if len(without) < len(parts):
-            notes += f"; no contact locations, because {', '.join(without)} has no pose"
+            notes.append(f"no contact locations, because {', '.join(without)} has no pose")
             _log.warning("%s: contact locations are left out: %s has no pose", path, without)
         for part in parts:
             part.pop("contact_location", None)
@@ -147,47 +149,18 @@ def rows_of_streams(
             input_sha256=sha256_of(path),
             licence=licence,
             palpate_version=__version__,
-            notes=notes,
+            notes="; ".join(notes),
         ),
         name=str(path),
     )
 
 
-def read_streams(path: Path) -> dict[str, SensorStreams]:
-    """Streams of every sensor of a record, by name, in order of writing.
-
-    Messages that break the contract, which the recorder keeps, are left out, and the log tells it.
-
-    Raises:
-        RecordingError: Not a whole record.
-    """
-    sensors: dict[str, SensorStreams] = {}
-    rejected = 0
-    for item in read_record(path):
-        topic = _STREAMS.get(item.address.topic)
-        if topic is None:
-            continue
-        streams = sensors.setdefault(item.address.sensor, SensorStreams())
-        try:
-            message = topic.codec.decode(item.payload)
-        except WireError:
-            rejected += 1
-            continue
-        if isinstance(message, ElectrodeFrame):
-            streams.frames.append(message)
-        elif isinstance(message, WrenchFrame):
-            streams.wrenches.append(message)
-        elif isinstance(message, IndenterPoseFrame):
-            streams.poses.append(message)
-        else:
-            streams.tares[message.tare_id] = message
-    if rejected:
-        _log.warning("%s: %d messages break the contract and are left out", path, rejected)
-    return sensors
-
-
-def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArray[Any]]:
+def _align(
+    path: Path, name: str, streams: SensorStreams, notes: list[str]
+) -> dict[str, npt.NDArray[Any]]:
+    """Columns of one finger; what a reader of the rows must know goes to ``notes``."""
     check_streams(path, name, streams)
+    notes.extend(f"serial number of {name}: {serial}" for serial in serials_of(streams))
     frames = [
         frame
         for frame in streams.frames
@@ -208,10 +181,13 @@ def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArr
     frames, times = [frames[i] for i in order], times[order]
     at = times + middles(frames)
 
-    force, kept = force_at(at, streams, clock)
+    force, kept, overloaded = force_at(path, name, at, streams, clock)
+    if overloaded:
+        notes.append(f"{overloaded} rows of {name} left out: {OVERLOAD}")
     location = None
     strength = np.linalg.norm(force, axis=1)
     touching, pressing = strength > TOUCH_N, strength >= PRESS_N
+    told = np.zeros(len(at), dtype=np.bool_)
     if streams.poses:
         positions = np.array([p.position for p in streams.poses], dtype=np.float64)
         # NaN = not known, and so is what lies between a known and an unknown one
@@ -224,8 +200,22 @@ def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArr
         kept = kept & has_pose
     if not kept.any():
         raise DatasetError(
-            f"{path}: no frame of {name!r} has a wrench (and pose) within three periods",
-            remedy="check that all streams were stamped by the same clock",
+            f"{path}: no frame of {name!r} has a wrench (and pose) within three periods"
+            + (f", but {overloaded} in which {OVERLOAD}" if overloaded else ""),
+            remedy="press more gently"
+            if overloaded
+            else "check that all streams were stamped by the same clock",
+        )
+    _check_zero(path, name, strength[kept & told & ~touching])
+    by_force = strength[kept & ~told]
+    if by_force.size and (least := by_force.min()) > TOUCH_N:
+        never = f"the force on {name} is never below {least:.2f} N, so all counts as one press"
+        notes.append(never)
+        _log.warning(
+            "%s: %s; if nothing touched at times, the force/torque sensor was not zeroed, and every"
+            " force is wrong by as much",
+            path,
+            never,
         )
     _log.info("%s: %d of %d frames of %s kept", path, kept.sum(), len(streams.frames), name)
 
@@ -244,66 +234,19 @@ def _align(path: Path, name: str, streams: SensorStreams) -> dict[str, npt.NDArr
     return columns
 
 
-def check_streams(path: Path, name: str, streams: SensorStreams) -> None:
-    """Refuse a sensor without a wrench, with other electrodes than a data set has, or times twice.
+def _check_zero(path: Path, name: str, untouched_n: npt.NDArray[np.float64]) -> None:
+    """Refuse a finger with a force where its pose says that nothing touches.
 
     Raises:
-        DatasetError: It is such; no frame is left out in silence.
+        DatasetError: The median of these magnitudes [N] is a touch.
     """
-    if not streams.wrenches:
+    if untouched_n.size and (usual := np.median(untouched_n)) > TOUCH_N:
         raise DatasetError(
-            f"{path}: sensor {name!r} has no wrench stream",
-            remedy="record the force/torque sensor in the finger's keys: of = NAME in its table",
+            f"{path}: the median force on {name!r} is {usual:.2f} N in the {untouched_n.size}"
+            " frames in which its pose says that nothing touches",
+            remedy="zero the force/torque sensor before recording, while nothing touches: palpate"
+            " tare NAME; or correct in_contact where the poses are made",
         )
-    others = [f.sensor_type for f in streams.frames if f.sensor_type is not SensorType.BIOTAC]
-    if others:
-        raise DatasetError(
-            f"{path}: {len(others)} of {len(streams.frames)} frames of {name!r} are of a "
-            f"{others[0].name} with {others[0].layout.electrodes} electrodes; a data set has "
-            f"{SensorType.BIOTAC.layout.electrodes}",
-            remedy="record BioTacs with 19 electrodes alone; models are trained for no other",
-        )
-    clock = streams.clock
-    _check_times(path, name, streams.frames, clock, "electrodes")
-    _check_times(path, name, streams.wrenches, clock, "wrench")
-    _check_times(path, name, streams.poses, clock, "pose")
-
-
-def _check_times(
-    path: Path, name: str, stream: Sequence[Stamped], clock: AlignmentClock, what: str
-) -> None:
-    """Refuse a stream whose clock went back, so that some of its times come twice."""
-    stamps = [message.stamp for message in stream]
-    times = times_of(stream, clock)
-    pairs = zip(itertools.pairwise(stamps), np.diff(times) < 0, strict=True)
-    # What was overtaken on the bus, or is played again, goes back in its sequence as well.
-    set_back = [
-        earlier and not (new.session_id == old.session_id and new.sequence < old.sequence)
-        for (old, new), earlier in pairs
-    ]
-    parts = np.cumsum([False, *set_back])
-    in_time = parts[np.argsort(times, kind="stable")]
-    if np.count_nonzero(np.diff(in_time)) > parts[-1]:
-        at = set_back.index(True)
-        back_s = (times[at] - times[at + 1]) * 1e-9
-        raise DatasetError(
-            f"{path}: the {clock.value} clock of the {what} of {name!r} goes back by {back_s:.2f} "
-            "s: some times come twice, and what belongs together is unknown",
-            remedy="record again, and leave the clocks alone meanwhile (docs/time.md)",
-        )
-
-
-def force_at(
-    times: Times, streams: SensorStreams, clock: AlignmentClock
-) -> tuple[Values, npt.NDArray[np.bool_]]:
-    """Force at times of a clock [N], shape (T, 3), and where it is known."""
-    forces = np.array([w.force for w in streams.wrenches], dtype=np.float64)
-    return linear(times, times_of(streams.wrenches, clock), forces)
-
-
-def middles(frames: Sequence[ElectrodeFrame]) -> Times:
-    """From each frame's stamp to the mean instant of its electrodes [ns]: 4 ms, live."""
-    return np.array([sample_offsets(frame).middle_ns for frame in frames], dtype=np.int64)
 
 
 def number_presses(

@@ -21,7 +21,7 @@ from palpate.alignment import linear, times_of
 from palpate.errors import ConfigError, DatasetError
 from palpate.rigid import Floats, Transform
 from palpate_training.datasets.container import csv_rows
-from palpate_training.datasets.ingest import (
+from palpate_training.datasets.record_streams import (
     SensorStreams,
     check_streams,
     force_at,
@@ -126,7 +126,7 @@ def _samples(record: Path, sensor: str, streams: SensorStreams) -> _AlignedSampl
     times, first = np.unique(times_of(frames, clock), return_index=True)
     frames = [frames[i] for i in first]
     at = times + middles(frames)
-    force, known = force_at(at, streams, clock)
+    force, known, _ = force_at(record, sensor, at, streams, clock)
     walls = np.array([frame.stamp.wall_ns for frame in frames], dtype=np.int64)
     return _AlignedSamples(
         at[known],
@@ -216,7 +216,8 @@ def _cut(
         raise DatasetError(
             f"{where}: no sample with electrodes, wrench and tip in the last"
             f" {late[worst] * 1e3:.0f} ms of increment {worst + 1}; at most {GAP_S * 1e3:g} ms",
-            remedy="record all streams at 100 Hz; leave this trajectory out by start_wall_ns",
+            remedy="record all streams at 100 Hz, without an overload of the force/torque sensor;"
+            " leave this trajectory out by start_wall_ns",
         )
     stops = kept[np.concatenate([[0], last])]
     _check_schedule(where, tip[stops] - item.poses[:, :3])

@@ -385,10 +385,16 @@ def known_rows(data: FeatureDataset) -> tuple[KnownRows, npt.NDArray[np.bool_]]:
         and magnitude[piece].max() >= PRESS_N
     ]
     if len(pieces) < PRESSES_LEAST:
+        more = "press the finger more often, in other places and directions; 20 are good"
+        never = (least := magnitude.min()) > TOUCH_N
         raise DatasetError(
             f"{data.name} holds {len(pieces)} presses of at least {PRESS_N:g} N;"
-            f" {PRESSES_LEAST} are needed",
-            remedy="press the finger more often, in other places and directions; 20 are good",
+            f" {PRESSES_LEAST} are needed"
+            + (f"; the force is never below {least:.2f} N" if never else ""),
+            remedy="zero the force/torque sensor while nothing touches the finger, press again, and"
+            " let go between presses"
+            if never
+            else more,
         )
     untouched = np.flatnonzero(~touched & np.isin(press, [press[piece[0]] for piece in pieces]))
     free = min(len(untouched), int(UNTOUCHED_SHARE * ROWS_MOST))
