@@ -652,6 +652,7 @@ def test_sample_is_small_and_playable(generated: GeneratedExperiment, tmp_path: 
         CliRunner().invoke(
             twin_app, [*words, "--rest", str(tmp_path / "rest")], catch_exceptions=False
         )
+    assert [path.name for path in tmp_path.iterdir()] == ["units.json"]
     done = CliRunner().invoke(twin_app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     small, whole = read_mixed(tmp_path / "s.h5"), generated.data.mixed
@@ -699,6 +700,38 @@ def test_the_rest_is_all_that_the_sample_lacks(
         np.testing.assert_array_equal(other.tared, whole.tared[whole.row_unit == 1])
     assert set(sampled.trajectories) == set(wanted)
     assert len(sampled.tared) + len(others[1].tared) == len(mixed)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "tape", "rest", "words"),
+    [
+        ("s.h5", "t.npz", "four", "--rest .*: its experiment.h5 is what the command reads"),
+        ("four/mixed.h5", "t.npz", None, "--dataset .* is what the command reads"),
+        ("link/experiment.h5", "t.npz", None, "--dataset .* is what the command reads"),
+        ("s.h5", f"four/{TRIALS}/t.npz", None, "--tape .* is inside what the command reads"),
+        ("rest/mixed.h5", "t.npz", "rest", "--dataset .* is a file of --rest, too"),
+    ],
+)
+def test_a_sample_is_not_written_over_what_it_is_taken_from(
+    tmp_path: Path, dataset: str, tape: str, rest: str | None, words: str
+) -> None:
+    """Told by the paths alone: the files are not even read."""
+    folder = tmp_path / "four"
+    (folder / TRIALS).mkdir(parents=True)
+    (tmp_path / "link").symlink_to(folder)
+    for name in (EXPERIMENT, MIXED):
+        (folder / name).write_text("hours of simulation")
+    with pytest.raises(ConfigError, match=words):
+        make_sample(
+            folder,
+            specimens(),
+            FemSimulator(),
+            tmp_path / dataset,
+            tmp_path / tape,
+            None if rest is None else tmp_path / rest,
+        )
+    for name in (EXPERIMENT, MIXED):
+        assert (folder / name).read_text() == "hours of simulation"
 
 
 @pytest.mark.parametrize("slow_starts", [1, 2])

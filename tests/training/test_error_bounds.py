@@ -14,7 +14,7 @@ from scipy.optimize import linprog
 from palpate.errors import BundleError, DatasetError
 from palpate.files.bundle import read_bundle
 from palpate.files.training_range import KnownInputs
-from palpate_training.datasets.features import FeatureDataset, write_dataset
+from palpate_training.datasets.features import FeatureDataset, joined, write_dataset
 from palpate_training.learning import intervals
 from palpate_training.learning.features_net import FeaturesNetConfig
 from palpate_training.learning.intervals import (
@@ -271,6 +271,48 @@ def test_each_other_sensor_counts_once(press_data: MakeData, trained: Path, tmp_
         found = held_out_features(new, sensor)
         wide = bounds(new.manifest.intervals.others[0], found.terms(new.known_inputs))
         assert np.mean(found.errors["force_magnitude"] <= wide) > 0.97
+
+
+def test_recordings_of_one_other_sensor_count_once(
+    press_data: MakeData, trained: Path, tmp_path: Path
+) -> None:
+    """A second recording of a sensor is no second sensor, however many of its rows there are."""
+    write_dataset(tmp_path / "held.h5", press_data(presses=40, seed=1))
+    recordings = [
+        replace(press_data(presses=30, seed=2 + k), sensor_names=("another",)) for k in range(2)
+    ]
+    paths = [tmp_path / f"{k}.h5" for k in range(2)]
+    for path, recording in zip(paths, recordings, strict=True):
+        write_dataset(path, recording)
+    write_dataset(tmp_path / "both.h5", joined(recordings))
+    found = []
+    for k, others in enumerate((paths, [tmp_path / "both.h5"])):
+        add_intervals(trained, [tmp_path / "held.h5"], tmp_path / f"{2 + k}", others=others)
+        found.append(read_bundle(tmp_path / f"{2 + k}").manifest.intervals)
+    apart, together = found
+    assert apart is not None
+    assert together is not None
+    assert apart.others == together.others
+    assert apart.others_source == together.others_source
+
+
+def test_presses_of_other_sensors_are_given_once(
+    press_data: MakeData, trained: Path, tmp_path: Path
+) -> None:
+    """Twice they would count as two sensors, or a sensor it is made for as another one."""
+    write_dataset(tmp_path / "held.h5", press_data(presses=40, seed=1))
+    write_dataset(tmp_path / "other.h5", press_data(presses=8, seed=2))
+    renamed = replace(press_data(presses=8, seed=2), sensor_names=("another",))
+    write_dataset(tmp_path / "renamed.h5", renamed)
+    for others in (("other", "other"), ("other", "renamed"), ("held",)):
+        with pytest.raises(DatasetError, match="hold the same presses"):
+            add_intervals(
+                trained,
+                [tmp_path / "held.h5"],
+                tmp_path / "2",
+                others=[tmp_path / f"{name}.h5" for name in others],
+            )
+    assert not (tmp_path / "2").exists()
 
 
 def test_what_cannot_calibrate_is_refused(

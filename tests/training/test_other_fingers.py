@@ -70,6 +70,19 @@ def test_a_finger_is_estimated_before_it_is_pressed(press_data: MakeData, tmp_pa
     assert np.median(errors) < 0.25 * np.median(size(new.force)[touched])
 
 
+def test_light_touches_of_other_fingers_are_touches(press_data: MakeData, tmp_path: Path) -> None:
+    """Here 0.2 to 0.5 N: they do not raise the force from which there is contact."""
+    known = press_data(presses=16)
+    assert known.in_contact is not None
+    light = known.in_contact & (size(known.force) < 0.5)
+    assert light.any()
+    thresholds = []
+    for k, data in enumerate((known, replace(known, in_contact=known.in_contact & ~light))):
+        train_unpressed(fingers_in(data), rest_of(data), tmp_path / f"{k}", name="features-two")
+        thresholds.append(read_bundle(tmp_path / f"{k}").manifest.contact_threshold_n)
+    assert thresholds[0] < 0.3 * thresholds[1]
+
+
 def test_bounds_of_several_other_fingers_are_those_of_a_finger_left_out(
     press_data: MakeData, tmp_path: Path
 ) -> None:

@@ -27,6 +27,7 @@ from palpate_training.tasks.force_real import (
     run_force_real,
     write_report,
 )
+from palpate_training.tasks.intervals import PRESSES_LEAST
 
 MakeData = Callable[..., FeatureDataset]
 MAGNITUDE, ANGLE = "force_magnitude_median_n", "force_angle_median_rad"
@@ -128,7 +129,7 @@ def test_a_bundle_has_the_version_that_its_folder_is_called(
 
     def train(*_: object, version: int, **__: object) -> FeaturesReport:
         asked.append(version)
-        return FeaturesReport(b"", {}, (1, 1, 1))
+        return FeaturesReport(b"", {}, (1, 1, 1), 20)
 
     monkeypatch.setattr(features, "train_features", train)
     arguments = ["features", "--data", "rows.h5", "--out", str(tmp_path / out), *options]
@@ -137,12 +138,24 @@ def test_a_bundle_has_the_version_that_its_folder_is_called(
     assert asked == [version]
 
 
+@pytest.mark.parametrize(("presses", "told"), [(1, True), (PRESSES_LEAST, False)])
+def test_bounds_of_few_presses_are_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, presses: int, told: bool
+) -> None:
+    report = FeaturesReport(b"", {}, (1, 1, 1), presses)
+    monkeypatch.setattr(features, "train_features", lambda *_, **__: report)
+    words = ["features", "--data", "rows.h5", "--out", str(tmp_path / "1")]
+    result = CliRunner().invoke(train_app, words, catch_exceptions=False, env={"COLUMNS": "300"})
+    assert ("too few to be relied on: 20 are needed" in result.output) is told
+
+
 def test_recordings_of_two_fingers_are_divided_by_their_blocks(
     two_sensors: FeatureDataset, tmp_path: Path
 ) -> None:
     write_dataset(tmp_path / "two.h5", two_sensors)
     config = FeaturesNetConfig(members=1, width=8, blocks=1, epochs=1)
-    train_features(tmp_path / "two.h5", tmp_path / "bundle", config=config)
+    report = train_features(tmp_path / "two.h5", tmp_path / "bundle", config=config)
+    assert report.bound_presses == 4
     manifest = read_bundle(tmp_path / "bundle").manifest
     assert "of 14 presses; tested on 4 other presses" in manifest.trained_on
 
@@ -178,6 +191,8 @@ def test_experiment_reports_every_model_beside_the_baselines(
         "force-real.md",
         "force-real.png",
     ]
+    text = (tmp_path / "out" / "force-real.md").read_text()
+    assert "Data: made by a test. Licence of its rows: free." in text
     facts = json.loads((tmp_path / "out" / "force-real.json").read_text())
     assert facts["blocks"] == {"one": 10, "two": 10}
     assert len(facts["results"]) == 4 * 4 + 2 * 3
@@ -187,6 +202,16 @@ def test_experiment_reports_every_model_beside_the_baselines(
     (tmp_path / "refused" / "force-real.md").mkdir(parents=True)
     with pytest.raises(DatasetError, match=r"cannot write .*force-real\.md"):
         write_report(tmp_path / "refused", report, command="test")
+
+
+def test_at_another_rate_a_second_beside_every_border_is_left_out(
+    two_sensors: FeatureDataset,
+) -> None:
+    """Blocks of 4 s at 100 rows a second last 0.4 s at 1000: nothing is a second from another."""
+    assert two_sensors.time_ns is not None
+    fast = replace(two_sensors, time_ns=two_sensors.time_ns // 10)
+    with pytest.raises(DatasetError, match="a guard of 1000 rows leaves nothing"):
+        run_force_real(fast, seeds=1)
 
 
 def test_a_report_that_cannot_be_written_is_told_before_the_trainings(

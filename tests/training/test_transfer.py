@@ -319,6 +319,39 @@ def test_without_a_press_an_unlike_finger_is_estimated_no_worse_than_by_a_consta
     assert not run_transfer([finger(1), of_its_kind], unlike)["unlike"]
 
 
+def presses_of_seconds(seconds: int, *, one_clock: bool = True) -> FeatureDataset:
+    """A recording of 100 rows a second with a label for every second, of one clock or of each."""
+    data = invented(1)
+    row = np.arange(ROWS)
+    label = (row // (100 * seconds)).astype(np.int32)
+    time = row if one_clock else row % (100 * seconds)
+    return replace(data, group=label, block=label, time_ns=time.astype(np.int64) * 10_000_000)
+
+
+def test_presses_in_the_order_of_their_labels_are_put_in_order_of_time() -> None:
+    """0, 1, 10, 11, ..., 2, 3: or rows are tested that were measured just after a labelled one."""
+    data = presses_of_seconds(1)
+    order = np.concatenate(
+        [np.flatnonzero(data.group == label) for label in sorted(np.unique(data.group), key=str)]
+    )
+    assert not np.array_equal(order, np.arange(ROWS))
+    shuffled = replace(data, **{name: column[order] for name, column in data.arrays().items()})
+    (one,), (other,) = fingers_of(data), fingers_of(shuffled)
+    for name in ("electrodes", "baseline", "segment", "force"):
+        np.testing.assert_array_equal(
+            getattr(other.recording, name), getattr(one.recording, name), err_msg=name
+        )
+    np.testing.assert_array_equal(other.tared, one.tared)
+    assert other.recording.period_s == one.recording.period_s
+
+
+def test_presses_with_a_clock_of_each_are_not_mixed() -> None:
+    data = presses_of_seconds(4, one_clock=False)
+    (one,) = fingers_of(data)
+    np.testing.assert_array_equal(one.recording.electrodes, data.electrodes)
+    np.testing.assert_array_equal(one.recording.segment, np.arange(ROWS) // 400)
+
+
 def test_electrodes_that_are_dead_do_not_make_a_finger_unlike_the_others() -> None:
     data = invented(2)
     for column in (data.electrodes, data.baseline):

@@ -196,6 +196,7 @@ def test_where_contact_is_not_known_rows_above_the_threshold_count(
     assert 0 < pressed.sum() < len(data)
     found = evaluate(of_features / "bundle", [tmp_path / "unknown.h5"])
     assert found.rows == pressed.sum()
+    assert found.as_dict()["assumed_contact_n"] == threshold_n
     for name, words in (
         ("unknown.h5", f"above {threshold_n:g} N"),
         ("mixed.h5", "in_contact says"),
@@ -229,6 +230,7 @@ def test_the_command_shows_and_writes(of_features: Path, tmp_path: Path) -> None
     assert "It was trained on presses of these data sets" in shown.output
     written = json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))
     assert written["schema"] == "palpate.evaluation 1"
+    assert written["assumed_contact_n"] is None
     first = written["figures"][0]
     assert (first["name"], first["unit"], first["where"]) == ("force_magnitude", "N", "all")
     assert first["ci95"][0] <= first["value"] <= first["ci95"][1]

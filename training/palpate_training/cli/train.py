@@ -363,6 +363,7 @@ def train_features_command(
     palpate train features --data presses.h5 --out models/features-virtual/1 --name features-virtual
     """
     from palpate_training.tasks.features import FEATURES_CONFIG, train_features
+    from palpate_training.tasks.intervals import PRESSES_LEAST
 
     version = _version(version, out)
     with _progress() as progress:
@@ -394,6 +395,13 @@ def train_features_command(
         )
         _finish(progress)
     _show(report.metrics, f"{name} {version}: unseen presses", out)
+    if report.bound_presses < PRESSES_LEAST:
+        console.print(
+            f"The bounds of its errors are of {report.bound_presses} tested presses, too few to be"
+            f" relied on: {PRESSES_LEAST} are needed. palpate train intervals takes presses that no"
+            " training has seen.",
+            markup=False,
+        )
 
 
 def train_population_command(

@@ -95,6 +95,7 @@ def _finger(data: FeatureDataset) -> Finger:
             f"{data.name}: the largest force is {most:.2g} N, and a press has {PRESS_N:g} N",
             remedy="give forces in newtons, of a finger that was pressed",
         )
+    data = _in_time(data)
     broken = np.diff(data.group, prepend=data.group[:1]) != 0
     if data.time_ns is not None:
         steps_s = 1e-9 * np.diff(data.time_ns.astype(np.float64))
@@ -107,6 +108,24 @@ def _finger(data: FeatureDataset) -> Finger:
         data.force.astype(np.float64),
     )
     return Finger(data.sensor_names[0], recording, data.tared_counts)
+
+
+def _in_time(data: FeatureDataset) -> FeatureDataset:
+    """The rows of a sensor with its presses in order of time, as far as their times tell it.
+
+    A table may hold them in the order of their labels. Where they overlap in time, as of a clock
+    that starts anew with each, they stay as they are.
+    """
+    if data.time_ns is None:
+        return data
+    piece = np.cumsum(
+        (np.diff(data.group, prepend=data.group[:1]) != 0)
+        | (np.diff(data.time_ns, prepend=data.time_ns[:1]) < 0)
+    )
+    order = np.argsort(data.time_ns, kind="stable")
+    if np.count_nonzero(np.diff(piece[order])) > piece[-1]:
+        return data
+    return replace(data, **{name: values[order] for name, values in data.arrays().items()})
 
 
 def refuse_same(names: Sequence[str], fingers: Sequence[Finger]) -> None:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -53,11 +54,13 @@ class OtherFinger:
         name: For people.
         rows: Rows of its presses.
         rest: Its untouched counts, shape (19,).
+        touched: In which rows it is touched, shape (N,).
     """
 
     name: str
     rows: KnownRows
     rest: Floats
+    touched: npt.NDArray[np.bool_]
 
 
 class OtherFingers(nn.Module):

@@ -171,6 +171,7 @@ class BundleErrors:
             "task": self.task,
             "data": [{"source": source, "sha256": digest} for source, digest in self.data],
             "trained_on": self.trained_on,
+            "assumed_contact_n": self.assumed_contact_n,
             "rows": self.rows,
             "presses": self.presses,
             "figures": [

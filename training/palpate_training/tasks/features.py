@@ -78,11 +78,13 @@ class FeaturesReport:
         digest: The bundle's digest, 32 bytes.
         metrics: Held-out results, as in the manifest.
         rows: Rows of train, validation and test.
+        bound_presses: How many presses the bounds of its errors are of.
     """
 
     digest: bytes
     metrics: dict[str, float]
     rows: tuple[int, int, int]
+    bound_presses: int
 
 
 def train_features(
@@ -112,7 +114,7 @@ def train_features(
     data = open_dataset(dataset_path)
     check_learnable(data)
     press = press_of(data)
-    split = by_group(press, seed=seed, recording=recording_of(data), guard_rows=_guard_rows(data))
+    split = by_group(press, seed=seed, recording=recording_of(data), guard_rows=guard_rows(data))
     x = data.tared_counts
     of_contact = _of_contact(data)
     touched = data.touching(MIN_CONTACT_THRESHOLD_N)
@@ -187,6 +189,7 @@ def train_features(
         )
 
     trained = known_inputs(x[split.train], press[split.train])
+    intervals = _intervals(data, tested, split.test, threshold, trained)
     force_sd = _residual_sd(validated[:, :3], data.force[split.validation])
     graph = FeaturesGraph(net, force_sd, contact_sd)
     digest = export_features(
@@ -216,11 +219,10 @@ def train_features(
         training_range=features_range(data, split.train),
         known_inputs=trained,
         sensor_serials=tuple(serials),
-        intervals=_intervals(data, tested, split.test, threshold, trained),
+        intervals=intervals,
     )
-    return FeaturesReport(
-        digest, metrics, (len(split.train), len(split.validation), len(split.test))
-    )
+    rows = (len(split.train), len(split.validation), len(split.test))
+    return FeaturesReport(digest, metrics, rows, intervals.presses)
 
 
 def features_range(data: FeatureDataset, rows: Rows) -> TrainingRange:
@@ -274,7 +276,7 @@ def _intervals(
     )
 
 
-def _guard_rows(data: FeatureDataset) -> int:
+def guard_rows(data: FeatureDataset) -> int:
     """Rows of ``GUARD_S``, of the sensor that has the most."""
     times = data.time_ns
     periods_s = (

@@ -1,9 +1,9 @@
 """Force on two real BioTacs: blocks held out, and a BioTac that was never seen.
 
-Each recording is cut into contiguous blocks (20 of about 9 s), 5 folds test every fifth block each,
-so every row is tested once; 1 s beside every border is left out. The rows of all folds are pooled.
-One network for each finger, as in the paper's "unseen trajectory"; for the unseen BioTac, one
-trained on the other finger. Longer and shorter blocks are reported beside.
+Each recording is cut into contiguous blocks (20 of about 9 s of LASA's), 5 folds test every fifth
+block each, so every row is tested once; 1 s beside every border is left out. The rows of all folds
+are pooled. One network for each finger, as in the paper's "unseen trajectory"; for the unseen
+BioTac, one trained on the other finger. Longer and shorter blocks are reported beside.
 
     palpate train force-real --data lasa.h5 --out docs/results
 """
@@ -26,6 +26,7 @@ from palpate_training.learning import baselines
 from palpate_training.learning.fit import FeaturesFitConfig, fit_quantity
 from palpate_training.learning.networks import predict
 from palpate_training.learning.splits import RowSplit, contiguous_folds, unseen_sensor
+from palpate_training.tasks.features import guard_rows
 from palpate_training.tasks.results import (
     ModelResult,
     OnNetwork,
@@ -39,14 +40,12 @@ FORCE_CONFIG = FeaturesFitConfig()
 """Chosen on validation blocks only; training/LOG.md has what was tried."""
 
 OTHER_BLOCKS = (10, 40)
-"""Blocks of a recording (about 18 s and 4.6 s each) that are reported beside the data set's own."""
+"""Blocks of a recording (LASA's: about 18 s and 4.6 s each), reported beside the data set's own."""
 
 NETWORK = "MLP"
 """Model whose numbers are the mean over the single networks: the headline everywhere."""
 
 FOLDS = 5
-GUARD_ROWS = 100
-"""1 s at 100 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +105,7 @@ def run_force_real(
     if unseen and len(data.sensor_names) > 1:
         for sensor, name in enumerate(data.sensor_names):
             split = unseen_sensor(
-                data.sensor, data.block, test_sensor=sensor, guard_rows=GUARD_ROWS
+                data.sensor, data.block, test_sensor=sensor, guard_rows=guard_rows(data)
             )
             compare(data, f"{name}, unseen", [split], seeds)
     for count in other_blocks:
@@ -116,6 +115,7 @@ def run_force_real(
     facts: dict[str, object] = {
         "data_sha256": data.content_sha256(),
         "source": data.provenance.source,
+        "licence": data.provenance.licence,
         "pairing": data.provenance.notes,
         "rows": {name: int(np.sum(data.sensor == i)) for i, name in enumerate(data.sensor_names)},
         "blocks": {
@@ -123,7 +123,7 @@ def run_force_real(
             for i, name in enumerate(data.sensor_names)
         },
         "folds": FOLDS,
-        "guard_rows": GUARD_ROWS,
+        "guard_rows": guard_rows(data),
         "seeds": seeds,
         "config": asdict(config),
     }
@@ -189,7 +189,7 @@ def _folds(data: FeatureDataset, sensor: int) -> list[RowSplit]:
     return [
         RowSplit(rows[split.train], rows[split.validation], rows[split.test], rows[split.guard])
         for split in contiguous_folds(
-            data.block[rows], data.group[rows], folds=FOLDS, guard_rows=GUARD_ROWS
+            data.block[rows], data.group[rows], folds=FOLDS, guard_rows=guard_rows(data)
         )
     ]
 
@@ -204,10 +204,8 @@ def _recut(group: npt.NDArray[np.int32], blocks: int) -> npt.NDArray[np.int32]:
 
 
 _PREFACE = """\
-LASA force calibration: two BioTacs, always in contact. Its authors state no licence, so this page
-holds numbers only. Electrodes are paired with the force of some rows earlier; "pairing" in
-force-real.json says how many. Inputs are raw counts minus the untouched baseline, standardised by
-the training rows.
+How electrodes and forces were paired is "pairing" in force-real.json. Inputs are raw counts minus
+the untouched baseline, standardised by the training rows.
 
 Held out are contiguous blocks, never single rows. Each recording is cut into blocks of equal
 length; each of five folds tests every fifth block; 1 s beside every border is left out; the test
@@ -235,7 +233,9 @@ def write_report(folder: Path, report: ForceReport, *, command: str) -> None:
     with written_whole(folder / "force-real.md") as part:
         part.write_text(
             "# Force on two real BioTacs\n\n"
-            f"Made by `{command}`.\n\n{_PREFACE}\n"
+            f"Made by `{command}`.\n\n"
+            f"Data: {report.facts['source']}. Licence of its rows: {report.facts['licence']}. This"
+            f" page holds numbers only.\n\n{_PREFACE}\n"
             + force_table(report.results)
             + "\nIn brackets: 95 % interval, whole blocks resampled. `/ std`: over the standard"
             " deviation of the true magnitude; `/ norm`: over the row's true magnitude.\n\n"

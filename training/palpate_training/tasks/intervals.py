@@ -134,13 +134,14 @@ def add_intervals(
         held_out: Data sets of presses that no training has seen: of features, or for fields mixed
             ones, of the sensors that the bundle was made for. A mixed one is good for both.
         out: Folder to write; must not exist. A number is the version.
-        others: Data sets of features of sensors that the bundle was not made for.
+        others: Data sets of features of sensors that the bundle was not made for. Recordings of one
+            sensor, by its name, count once.
         unlike: Share of the rows held out that may be flagged by how their values go together.
 
     Raises:
         BundleError: It breaks its contract, knows no training rows, or ``out`` exists.
-        DatasetError: A data set breaks its schema, holds too few presses, those of another one, or
-            was trained on.
+        DatasetError: A data set breaks its schema, holds too few presses, those of another one
+            (``others`` included), or was trained on.
     """
     refuse_existing(out)
     bundle = read_bundle(old)
@@ -153,8 +154,17 @@ def add_intervals(
             " upgrade",
         )
     sets = [read_held_out(bundle, path) for path in held_out]
+    sensors = _read_others(bundle, others)
     refuse_repeated(held_out, [(one.rows.tared, one.rows.force_n[:, None]) for one in sets])
-    refuse_same_presses(held_out, [one.data for one in sets if one.data is not None])
+    of_features = {
+        str(path): one.data
+        for path, one in zip(held_out, sets, strict=True)
+        if one.data is not None
+    }
+    refuse_same_presses(
+        [*of_features, *(sensor.name for sensor, _ in sensors)],
+        [*of_features.values(), *(sensor for sensor, _ in sensors)],
+    )
     found = joined([one.rows for one in sets])
     presses = len(np.unique(found.press))
     for path, one in zip(held_out, sets, strict=True):
@@ -170,7 +180,7 @@ def add_intervals(
         )
     known, strange = with_pattern(bundle.known_inputs, found.tared, found.press, unlike=unlike)
     formulas = fit_formulas(found.errors, found.terms(known, strange), found.press)
-    other, other_source = _of_others(bundle, known, others)
+    other, other_source = _of_others(known, sensors)
     intervals = Intervals(
         LEVEL,
         f"{len(found.press)} rows of {presses} presses that no training saw: "
@@ -232,17 +242,9 @@ def joined(parts: Sequence[HeldOut]) -> HeldOut:
     )
 
 
-def _of_others(
-    bundle: Bundle, known: KnownInputs, others: Sequence[Path]
-) -> tuple[tuple[BoundFormula, ...], str]:
-    """Formulas of sensors that the bundle was not made for, and where they come from.
-
-    Each sensor counts once, so with fewer than ten the bounds hold for all of them: presses of one
-    are alike, and tell nothing of the next sensor.
-    """
-    if not others:
-        return (), ""
-    if bundle.manifest.task != "features":
+def _read_others(bundle: Bundle, others: Sequence[Path]) -> list[tuple[FeatureDataset, HeldOut]]:
+    """Every sensor of data sets of features, and what a bundle makes of it."""
+    if others and bundle.manifest.task != "features":
         raise DatasetError(
             "no other sensor's fields are known", remedy="give other sensors for features only"
         )
@@ -251,12 +253,28 @@ def _of_others(
         for data in (open_dataset(path) for path in others)
         for name in data.sensor_names
     ]
-    parts = [held_out_features(bundle, sensor) for sensor in sensors]
-    rows = joined(parts)
-    number = np.repeat(np.arange(len(parts)), [len(part.press) for part in parts])
+    return [(sensor, held_out_features(bundle, sensor)) for sensor in sensors]
+
+
+def _of_others(
+    known: KnownInputs, sensors: Sequence[tuple[FeatureDataset, HeldOut]]
+) -> tuple[tuple[BoundFormula, ...], str]:
+    """Formulas of sensors that the bundle was not made for, and where they come from.
+
+    Each sensor counts once, so with fewer than ten the bounds hold for all of them: presses of one
+    are alike, and tell nothing of the next sensor. Sensors of the same name are the same sensor.
+    """
+    if not sensors:
+        return (), ""
+    names = [sensor.sensor_names[0] for sensor, _ in sensors]
+    different = list(dict.fromkeys(names))
+    rows = joined([part for _, part in sensors])
+    number = np.repeat(
+        [different.index(name) for name in names], [len(part.press) for _, part in sensors]
+    )
     errors = {name: rows.errors[name] for name in ("force_magnitude", "force")}
-    names = ", ".join(name for sensor in sensors for name in sensor.sensor_names)
     return (
         fit_formulas(errors, rows.terms(known), number, use=OF_OTHERS),
-        f"{len(number)} rows of {names}, for which it was not made; another may need more",
+        f"{len(number)} rows of {', '.join(different)}, for which it was not made; another may need"
+        " more",
     )

@@ -17,7 +17,6 @@ import numpy as np
 from palpate.errors import DatasetError
 from palpate.files.hdf5 import add_array
 from palpate_training.datasets.features import FeatureDataset, of_sensor
-from palpate_training.datasets.ingest import PRESS_N
 from palpate_training.learning.export import refuse_existing
 from palpate_training.learning.force_process import Floats, KnownRows
 from palpate_training.learning.other_fingers import OtherFinger, OtherFingers
@@ -44,7 +43,8 @@ def fingers_in(data: FeatureDataset) -> list[OtherFinger]:
             continue
         one = of_sensor(data, name)
         rest = one.baseline.mean(axis=0, dtype=np.float64)
-        found.append(OtherFinger(name, known_rows(one)[0], rest))
+        rows, touched = known_rows(one)
+        found.append(OtherFinger(name, rows, rest, touched))
     return found
 
 
@@ -80,7 +80,8 @@ def train_unpressed(
         )
     estimates, constants, rows = [], [], []
     first = 0
-    for known, tested in _left_out(others):
+    left_out = _left_out(others)
+    for known, tested in left_out:
         estimates.append(estimate_of(OtherFingers(known, tested.rest), tested.rows.tared))
         mean = np.vstack([one.rows.force for one in known]).mean(axis=0)
         constants.append(np.broadcast_to(mean, tested.rows.force.shape))
@@ -90,7 +91,7 @@ def train_unpressed(
     tested_rows = KnownRows(
         *(np.concatenate([getattr(one, name) for one in rows]) for name in KnownRows.__slots__)
     )
-    touched = np.linalg.norm(tested_rows.force, axis=1) >= PRESS_N
+    touched = np.concatenate([tested.touched for _, tested in left_out])
     said = HeldOutPresses.of(
         np.vstack(estimates), tested_rows, touched, {"constant": np.vstack(constants)}
     )
@@ -124,5 +125,8 @@ def _left_out(others: Sequence[OtherFinger]) -> list[tuple[list[OtherFinger], Ot
     (one,) = others
     presses = np.unique(one.rows.press)
     early = np.isin(one.rows.press, presses[: len(presses) // 2])
-    halves = [replace(one, rows=one.rows.where(kept)) for kept in (early, ~early)]
+    halves = [
+        replace(one, rows=one.rows.where(kept), touched=one.touched[kept])
+        for kept in (early, ~early)
+    ]
     return [([halves[1]], halves[0]), ([halves[0]], halves[1])]

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import DatasetError
-from palpate.files.tape import write_tape
+from palpate.errors import ConfigError, DatasetError
+from palpate.files.outputs import check_folder, check_output
+from palpate.files.tape import Tape, write_tape
 from palpate.files.tape_build import TapePress, build_tape, tape_specimen
 from palpate_training.datasets.basis import encode, fit_basis, subset
 from palpate_training.datasets.experiment import (
@@ -63,21 +64,51 @@ def make_sample(
         Ids of the trajectories of both, and the number of trials in the data set.
 
     Raises:
-        DatasetError: The folder is no finished experiment, one of other specimens, or damaged.
+        ConfigError: A file to write is one of the experiment, is named twice, or cannot be written.
+        DatasetError: The folder is no finished experiment, one of other specimens, or damaged, or
+            nothing is left for ``rest``. Nothing is written then.
     """
+    _check_outputs(folder, dataset, tape, rest)
     mixed = read_mixed(folder / MIXED)
     wanted = _picked(mixed)
     trials = _trials(mixed.experiment, wanted, inside=True)
+    played = _tape(folder, specimens, simulator.open_store(folder / STORE), wanted)
+    small = _fewer_modes(subset(mixed, trials))
     if rest is not None:
         experiment = read_experiment(folder / EXPERIMENT)
+        others = subset(experiment, _trials(experiment, wanted, inside=False))
+        others_mixed = subset(mixed, _trials(mixed.experiment, wanted, inside=False))
         rest.mkdir(parents=True, exist_ok=True)
-        others = _trials(experiment, wanted, inside=False)
-        write_experiment(rest / EXPERIMENT, subset(experiment, others))
-        write_mixed(rest / MIXED, subset(mixed, _trials(mixed.experiment, wanted, inside=False)))
-    small = _fewer_modes(subset(mixed, trials))
+        write_experiment(rest / EXPERIMENT, others)
+        write_mixed(rest / MIXED, others_mixed)
     write_mixed(dataset, small)
-    _write_tape(folder, specimens, simulator.open_store(folder / STORE), wanted, tape)
+    write_tape(tape, played)
     return wanted, len(trials)
+
+
+def _check_outputs(folder: Path, dataset: Path, tape: Path, rest: Path | None) -> None:
+    """Refuse files to write that are read, written twice, or cannot be written."""
+    check_output(dataset, "--dataset", ".h5", folder / EXPERIMENT, folder / MIXED)
+    check_output(tape, "--tape", ".npz")
+    kept = [(folder / name).resolve() for name in (STORE, TRIALS)]
+    for option, path in (("--dataset", dataset), ("--tape", tape)):
+        if not set(kept).isdisjoint(path.resolve().parents):
+            raise ConfigError(
+                f"{option} {path} is inside what the command reads", remedy="name another file"
+            )
+    if rest is None:
+        return
+    check_folder(rest, "--rest")
+    for name in (EXPERIMENT, MIXED):
+        written = (rest / name).resolve()
+        if written in ((folder / EXPERIMENT).resolve(), (folder / MIXED).resolve()):
+            raise ConfigError(
+                f"--rest {rest}: its {name} is what the command reads", remedy="name another folder"
+            )
+        if written == dataset.resolve():
+            raise ConfigError(
+                f"--dataset {dataset} is a file of --rest, too", remedy="name another file"
+            )
 
 
 def _picked(mixed: MixedDataset) -> tuple[str, ...]:
@@ -112,13 +143,9 @@ def _fewer_modes(mixed: MixedDataset) -> MixedDataset:
     return replace(mixed, basis=basis, coefficients=encode(basis, fields), contact=contact)
 
 
-def _write_tape(
-    folder: Path,
-    specimens: Sequence[Specimen],
-    store: IndentationStore,
-    names: Sequence[str],
-    path: Path,
-) -> None:
+def _tape(
+    folder: Path, specimens: Sequence[Specimen], store: IndentationStore, names: Sequence[str]
+) -> Tape:
     fingertip = store.fingertip()
     mesh = skin_mesh(fingertip)
     presses, rests = [], {}
@@ -133,7 +160,7 @@ def _write_tape(
         counts = np.stack([done.counts[one.name] for one in specimens])
         rest_pa = fingertip.fluid_pressure_pa
         presses.append(_press(name, store.trajectory(name), counts, rest_pa))
-    build = build_tape(
+    return build_tape(
         specimens=[
             tape_specimen(one.name, one.parameters_json, rests[one.name]) for one in specimens
         ],
@@ -145,7 +172,6 @@ def _write_tape(
         mesh_sha256=bytes.fromhex(mesh.sha256),
         source="palpate data generate; made by palpate, use as you like",
     )
-    write_tape(path, build)
 
 
 def _press(name: str, trajectory: SimulatedTrajectory, counts: Floats, rest_pa: float) -> TapePress:
