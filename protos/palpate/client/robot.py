@@ -97,7 +97,7 @@ def _close_all() -> None:
 
 
 class Client(Closing):
-    """A robot's view of a station.
+    """A robot's view of a station. Open one and keep it: joining and leaving take time.
 
     Methods take the name of a ``sensor``, and as ``timeout_s`` how long an answer may take [s];
     None = the client's timeout.
