@@ -171,7 +171,8 @@ def test_sessions_that_were_open_for_a_moment_leave_no_sockets(
             return process
 
         for peer in [start(_PEER) for _ in range(2)]:
-            assert peer.stdout is not None and peer.stdout.readline() == "joined\n"
+            assert peer.stdout is not None
+            assert peer.stdout.readline() == "joined\n"
         for _ in range(2 * (os.cpu_count() or 1)):
             start("while True: pass")
         before = sockets()
