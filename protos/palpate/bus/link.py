@@ -54,7 +54,7 @@ from palpate.bus.zenoh_session import (
     while_open,
 )
 from palpate.config import LinkConfig, check_name
-from palpate.errors import LinkError, PalpateError, WireError
+from palpate.errors import ConfigError, LinkError, PalpateError, WireError
 from palpate.process import Closing
 
 _OBSERVER_WAIT_S = 1.0
@@ -124,6 +124,7 @@ class Session(Closing):
         Raises:
             LinkError: No router within ``link.wait_for_router_s``, a port is in use, or a session
                 was opened before a fork.
+            ConfigError: Its certificates cannot be used.
         """
         raw = open_zenoh(link, "peer" if link.links_directly else "client")
         # Zenoh opens a peer at once and looks for the router in the background.
@@ -493,7 +494,7 @@ class Session(Closing):
     def _views(self) -> list[zenoh.Session]:
         """Sessions that together know the tokens of all."""
         views = [self._raw]
-        with contextlib.suppress(LinkError):  # the router is gone
+        with contextlib.suppress(LinkError, ConfigError):  # no router, or other certificates
             observer = self.observer()
             if observer is not self:
                 views.append(observer._raw)
@@ -507,6 +508,7 @@ class Session(Closing):
 
         Raises:
             LinkError: There is no router, or this session is closed.
+            ConfigError: Its certificates cannot be used by now.
         """
         if not self._link.links_directly or not self._link.connect:
             return self
@@ -532,7 +534,7 @@ class Session(Closing):
             return self._raw
         try:
             return self.observer()._raw
-        except LinkError:  # there are only peers
+        except (LinkError, ConfigError):  # only peers, or other certificates by now
             return self._raw
 
     def _young(self) -> bool:
