@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,7 +20,7 @@ from palpate.bus.access import PUBLISHERS, QUESTIONS, Deed, rights
 from palpate.bus.endpoints import ENDPOINTS
 from palpate.bus.topics import STATION_ROOT, TOPICS, sensor_key, service_key
 from palpate.config import LinkConfig, Role, RouterOptions, TlsConfig
-from palpate.errors import ConfigError
+from palpate.errors import ConfigError, LinkError
 
 LIVE_S = 30.0
 QUIET_S = 1.0
@@ -266,3 +267,36 @@ def test_ros_needs_a_router_of_its_own(authority: Path) -> None:
     assert other.connect == ("tls/127.0.0.1:2",)
     assert not other.has_roles
     assert RouterOptions().changed(own) == own
+
+
+_HALF = "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"
+
+
+@pytest.mark.parametrize("text", ["", "hello", _HALF, None], ids=["empty", "words", "half", "none"])
+@pytest.mark.parametrize("name", ["ca.pem", "cert.pem", "key.pem"])
+def test_a_file_that_is_no_certificate_is_named(
+    authority: Path, tmp_path: Path, name: str, text: str | None
+) -> None:
+    folder = shutil.copytree(authority / "robot", tmp_path / "robot")
+    link = LinkConfig(connect=("tls/127.0.0.1:1",), tls=TlsConfig.of_folder(folder))
+    (folder / name).unlink() if text is None else (folder / name).write_text(text)
+    what = "private key" if name == "key.pem" else "certificate"
+    with pytest.raises(ConfigError, match=rf"robot/{name} cannot be used as {what}: \w+") as caught:
+        Session.open(link)
+    assert "palpate certs issue" in caught.value.remedy
+
+
+def test_a_key_of_another_certificate_is_named(authority: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(authority / "robot", tmp_path / "robot")
+    shutil.copy(authority / "service" / "key.pem", folder)
+    link = LinkConfig(connect=("tls/127.0.0.1:1",), tls=TlsConfig.of_folder(folder))
+    with pytest.raises(ConfigError, match=r"robot/key.pem cannot be used as private key: .*match"):
+        Session.open(link)
+
+
+def test_an_error_of_zenoh_is_told_without_places_in_its_source(free_port: int) -> None:
+    listen = (f"tcp/no-such-host.invalid:{free_port}",)
+    link = LinkConfig(connect=()).model_copy(update={"listen": listen})
+    with pytest.raises(LinkError, match="cannot join the bus: ") as caught:
+        Session.open(link)
+    assert ".rs:" not in str(caught.value)

@@ -251,6 +251,44 @@ def test_calls_that_take_all_threads_are_cancelled() -> None:
     assert all(cancelled), "none ends by its own time"
 
 
+@pytest.mark.parametrize("name", ["next_features", "features"])
+def test_waits_for_estimates_that_are_cancelled_give_their_threads_back(
+    link: LinkConfig, finger: Finger, name: str
+) -> None:
+    """Each kept its thread until its own time, and after 32 of them every call hung."""
+
+    async def scene() -> None:
+        async with AsyncClient(link.connect[0], timeout_s=60 * LIVE_S) as robot:
+
+            def wait() -> Coroutine[Any, Any, object]:
+                if name == "features":
+                    return robot.features("nobody")
+                return robot.next_features("nobody", timeout_s=60 * LIVE_S)
+
+            waits = [asyncio.create_task(wait()) for _ in range(_AT_ONCE)]
+            await asyncio.sleep(0.2)
+            for one in waits:
+                one.cancel()
+            estimate = await robot.features("finger", max_age_s=LIVE_S)
+            assert estimate.source.sequence > 0
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
+def test_a_stream_ends_whose_client_is_closed_underneath(link: LinkConfig, finger: Finger) -> None:
+    async def scene() -> None:
+        async with AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot:
+            stream = robot.stream_features("finger", max_age_s=LIVE_S)
+            await anext(stream)
+            await asyncio.to_thread(robot.sync.close)
+            [_ async for _ in stream]
+            assert stream.closed
+            with pytest.raises(StopAsyncIteration):
+                await anext(stream)
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
 def test_a_client_whose_calls_take_all_threads_opens_streams_and_can_be_closed(
     link: LinkConfig, finger: Finger
 ) -> None:

@@ -42,9 +42,7 @@ from palpate.errors import (
     StaleError,
     StreamTimeout,
 )
-from palpate.messages import (
-    FeatureEstimate,
-)
+from palpate.messages import FeatureEstimate, FieldFrame
 
 
 @pytest.fixture
@@ -177,6 +175,19 @@ def test_a_callback_runs_in_a_thread_of_ours_and_may_fail(
     assert watch.counters["called"] == called, "closed is closed"
 
 
+def test_a_callback_that_exits_does_not_end_its_watch(
+    finger: Finger, robot: Client, wait_until: WaitUntil, caplog: pytest.LogCaptureFixture
+) -> None:
+    """``sys.exit()`` in a callback ended the thread, and nobody was told."""
+
+    def callback(_: FeatureEstimate) -> None:
+        sys.exit("stop")
+
+    with robot.stream_features("finger", max_age_s=LIVE_S).call(callback) as watch:
+        wait_until(lambda: watch.counters["callback_errors"] > 2, timeout_s=LIVE_S)
+    assert "SystemExit: stop" in caplog.text
+
+
 def test_another_sensor_under_the_name_is_told_once(finger: Finger, robot: Client) -> None:
     told: list[PalpateError] = []
     called: list[str] = []
@@ -210,17 +221,21 @@ def test_a_callback_is_told_of_a_silence_and_may_close_its_own_watch(
     finger.silent = True
     stream = robot.stream_features("finger", max_age_s=LIVE_S, timeout_s=0.1)
     done = threading.Event()
+    called: list[int] = []
 
-    def once(_: FeatureEstimate) -> None:
-        watch.close()
-        done.set()
+    def once(estimate: FeatureEstimate) -> None:
+        if not finger.silent:  # else it was on its way before the silence
+            called.append(estimate.source.sequence)
+            watch.close()
+            done.set()
 
     watch = stream.call(once, on_error=told.append)
     wait_until(lambda: len(told) >= 2, timeout_s=LIVE_S)
     assert all(isinstance(error, StreamTimeout) for error in told)
     finger.silent = False
     assert done.wait(LIVE_S)
-    assert watch.counters["called"] == 1
+    watch.close()
+    assert len(called) == 1
 
 
 @contextmanager
@@ -300,6 +315,7 @@ def test_streams_and_questions_go_on_after_router_and_service_were_gone(
         lambda robot: robot.zero("wrist", readings=-1),
         lambda robot: robot.model(service="no/such"),
         lambda robot: robot.cancel_simulation("r-1", sensor="*"),
+        lambda robot: robot.synthesise(cast("FieldFrame", simulation_request())),
         lambda robot: robot.simulate(simulation_request(), sensor="*"),
         lambda robot: robot.simulate(simulation_request(), timeout_s=-1.0),
         lambda robot: robot.simulate(simulation_request(), timeout_s=math.nan),
@@ -347,6 +363,47 @@ def test_a_program_that_leaves_its_client_open_ends_well(link: LinkConfig, finge
             check=False,
         )
         assert (result.returncode, result.stdout, result.stderr) == (0, "ends\n", "")
+
+
+_NOBODY_HOLDS = """
+import gc, sys, threading
+from palpate import Client
+
+seen = threading.Semaphore(0)
+
+def watch():
+    return Client(sys.argv[1], timeout_s=20).stream_features("finger", max_age_s=20.0).call(
+        lambda estimate: seen.release()
+    )
+
+def iterate():
+    for estimate in Client(sys.argv[1], timeout_s=20).stream_features("finger", max_age_s=20.0):
+        seen.release()
+
+if sys.argv[2] == "watch":
+    watch()
+else:
+    threading.Thread(target=iterate, daemon=True).start()
+for _ in range(5):
+    assert seen.acquire(timeout=20)
+gc.collect()
+for _ in range(200):
+    assert seen.acquire(timeout=20)
+print("ends")
+"""
+
+
+@pytest.mark.parametrize("use", ["watch", "iterate"])
+def test_a_stream_in_use_keeps_its_client(link: LinkConfig, finger: Finger, use: str) -> None:
+    """Nobody closed the client at the end of the program, which was aborted: exit 134."""
+    result = subprocess.run(
+        [sys.executable, "-c", _NOBODY_HOLDS, link.connect[0], use],
+        capture_output=True,
+        text=True,
+        timeout=6 * LIVE_S,
+        check=False,
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, "ends\n", "")
 
 
 _FORKS = """

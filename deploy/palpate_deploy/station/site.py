@@ -6,7 +6,7 @@ import threading
 
 from palpate.bus import Session, SiteLink, run_router
 from palpate.config import LinkConfig
-from palpate.errors import LinkError
+from palpate.errors import ConfigError, LinkError
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState
 from palpate_deploy.station.profile import Profile
@@ -41,6 +41,9 @@ def _tell(site: SiteLink, instance: str, link: LinkConfig, stop: threading.Event
         try:
             session = Session.open(own, station=site.station)
         except LinkError:
+            continue
+        except ConfigError:  # certificates that are being renewed
+            stop.wait(_PERIOD_S)
             continue
         with session:
             presence = session.presence("router", instance=instance)

@@ -13,7 +13,7 @@ import zenoh
 
 from palpate.bus.delivery import FifoQueue
 from palpate.bus.ring import is_wake, subscription_closed, undeclare
-from palpate.bus.zenoh_session import Declared
+from palpate.bus.zenoh_session import Declared, said
 from palpate.errors import LinkError, StreamTimeout
 
 
@@ -110,7 +110,7 @@ class ForeignPublisher(Declared):
             self._publisher.put(payload, attachment=attachment)
         except (zenoh.ZError, RuntimeError) as error:  # RuntimeError: it is being undeclared
             raise LinkError(
-                f"cannot publish on {self.key}: {error}", remedy="open the session again"
+                f"cannot publish on {self.key}: {said(error)}", remedy="open the session again"
             ) from error
 
     def close(self) -> None:

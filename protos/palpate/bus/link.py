@@ -54,7 +54,7 @@ from palpate.bus.zenoh_session import (
     while_open,
 )
 from palpate.config import LinkConfig, check_name
-from palpate.errors import LinkError, PalpateError, WireError
+from palpate.errors import ConfigError, LinkError, PalpateError, WireError
 from palpate.process import Closing
 
 _OBSERVER_WAIT_S = 1.0
@@ -68,6 +68,9 @@ _LEAVE_S = 1.0
 
 _YOUNG_S = 2.0
 """Within this time the links of a session to all processes of its station have come up [s]."""
+
+_SETTLED_S = 0.2
+"""A young session whose links have not changed for so long is taken to have all of them [s]."""
 
 M = TypeVar("M")
 Q = TypeVar("Q")
@@ -121,6 +124,7 @@ class Session(Closing):
         Raises:
             LinkError: No router within ``link.wait_for_router_s``, a port is in use, or a session
                 was opened before a fork.
+            ConfigError: Its certificates cannot be used.
         """
         raw = open_zenoh(link, "peer" if link.links_directly else "client")
         # Zenoh opens a peer at once and looks for the router in the background.
@@ -490,7 +494,7 @@ class Session(Closing):
     def _views(self) -> list[zenoh.Session]:
         """Sessions that together know the tokens of all."""
         views = [self._raw]
-        with contextlib.suppress(LinkError):  # the router is gone
+        with contextlib.suppress(LinkError, ConfigError):  # no router, or other certificates
             observer = self.observer()
             if observer is not self:
                 views.append(observer._raw)
@@ -504,6 +508,7 @@ class Session(Closing):
 
         Raises:
             LinkError: There is no router, or this session is closed.
+            ConfigError: Its certificates cannot be used by now.
         """
         if not self._link.links_directly or not self._link.connect:
             return self
@@ -529,7 +534,7 @@ class Session(Closing):
             return self._raw
         try:
             return self.observer()._raw
-        except LinkError:  # there are only peers
+        except (LinkError, ConfigError):  # only peers, or other certificates by now
             return self._raw
 
     def _young(self) -> bool:
@@ -541,7 +546,11 @@ class Session(Closing):
         return bool(self._raw.info.routers_zid())
 
     def close(self) -> None:
-        """Leave the bus; takes up to 10 s where the router hangs. In a forked process: nothing."""
+        """Leave the bus; takes up to 10 s where the router hangs. In a forked process: nothing.
+
+        One that was opened less than 2 s ago first waits until its links have come up, which takes
+        0.2 s as a rule.
+        """
         if not is_inherited():
             for one in reversed(self._declared):
                 with contextlib.suppress(zenoh.ZError):  # undeclared before, or the session is gone
@@ -549,8 +558,24 @@ class Session(Closing):
             self._declared.clear()
             if self._observing is not None:
                 self._observing.close()
+            self._settle()
             close_zenoh(self._raw)
         _open.discard(self)  # last: after Ctrl-C in here it is closed at the end of the process
+
+    def _settle(self) -> None:
+        """Wait for the links of a young session: one that comes up while Zenoh closes never ends.
+
+        Behind it the whole session lives on: its sockets here and at the others, and its threads.
+        """
+        if self._raw.is_closed() or not (self._link.links_directly and self._link.connect):
+            return
+        links: set[tuple[str, str]] = set()
+        changed_s = time.monotonic()
+        while self._young() and time.monotonic() - changed_s < _SETTLED_S:
+            found = {(str(one.src), str(one.dst)) for one in self._raw.info.links()}
+            if found != links:
+                links, changed_s = found, time.monotonic()
+            time.sleep(0.02)
 
     def _keep(self, thing: K) -> K:
         with self._declaring:

@@ -55,8 +55,8 @@ def _why_no_link(link: LinkConfig, endpoint: str) -> LinkError | None:
                 "another by the authority of that router: palpate certs issue",
             )
         return LinkError(
-            f"what listens at {endpoint} does not speak TLS, or its certificates cannot be read",
-            remedy=f"without certificates connect to tcp/{place}; see yours: palpate certs show",
+            f"what listens at {endpoint} does not speak TLS",
+            remedy=f"without certificates connect to tcp/{place}",
         )
     except OSError:
         return None

@@ -26,7 +26,7 @@ from palpate.bus.topics import (
     check_size,
     parse_key,
 )
-from palpate.bus.zenoh_session import Declared, check_process, while_open
+from palpate.bus.zenoh_session import Declared, check_process, said, while_open
 from palpate.errors import LinkError, StaleError, StreamTimeout, WireError
 from palpate.messages import StageTimings, Stamp
 
@@ -115,7 +115,7 @@ class Publisher(Generic[M], Declared):
             self._publisher.put(payload, attachment=attachment)
         except (zenoh.ZError, RuntimeError) as error:  # RuntimeError: it is being undeclared
             raise LinkError(
-                f"cannot publish on {self.key}: {error}", remedy="open the session again"
+                f"cannot publish on {self.key}: {said(error)}", remedy="open the session again"
             ) from error
 
     @while_open()

@@ -21,7 +21,7 @@ from palpate.bus.attachments import OnTimings, attachment_of, timings_of
 from palpate.bus.endpoints import Endpoint
 from palpate.bus.presence import alive, other_stations
 from palpate.bus.topics import ENCODING_PREFIX, MAX_MESSAGE_BYTES, check_schema, check_size
-from palpate.bus.zenoh_session import while_open
+from palpate.bus.zenoh_session import said, while_open
 from palpate.codec import ERROR
 from palpate.config import check_duration
 from palpate.errors import (
@@ -150,7 +150,7 @@ def ask(
         )
     except zenoh.ZError as error:
         if cancellation is None or not cancellation.cancelled.is_set():
-            problem = f"cannot ask {key}: {error}"
+            problem = f"cannot ask {key}: {said(error)}"
             raise LinkError(problem, remedy="open the session again") from error
         replies.put(None)  # cancelled before it was sent: there is no reply
     silent = True

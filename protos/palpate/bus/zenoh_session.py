@@ -7,7 +7,9 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterator, Sequence
+import ssl
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -17,7 +19,7 @@ from palpate.bus.no_router import no_router
 from palpate.bus.topics import (
     MAX_MESSAGE_BYTES,
 )
-from palpate.config import LinkConfig
+from palpate.config import LinkConfig, TlsConfig
 from palpate.errors import ConfigError, LinkError
 from palpate.process import Closing
 
@@ -34,7 +36,8 @@ def zenoh_config(link: LinkConfig, mode: str) -> zenoh.Config:
     """Settings of a session of ``mode`` ``"peer"``, ``"client"`` or ``"router"``.
 
     Raises:
-        ConfigError: A router is to be reached without certificates, although roles are asked for.
+        ConfigError: A router is to be reached without certificates, although roles are asked for,
+            or one of them cannot be read.
     """
     _check_certificates(link)
     client = mode == "client"
@@ -119,6 +122,34 @@ def _check_certificates(link: LinkConfig) -> None:
             f"{plain[0]} shows no certificate, so that nothing it says would be believed",
             remedy=f"connect to tls/{plain[0].partition('/')[2]}, or set tls.roles = false",
         )
+    if link.tls is not None:
+        _read_certificates(link.tls)
+
+
+def _read_certificates(tls: TlsConfig) -> None:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    readings: dict[Path, Callable[[], None]] = {
+        tls.root_ca_certificate: lambda: context.load_verify_locations(tls.root_ca_certificate),
+        tls.certificate: lambda: context.load_verify_locations(tls.certificate),
+        # Without a password, OpenSSL would ask for one at the terminal.
+        tls.private_key: lambda: context.load_cert_chain(
+            tls.certificate, tls.private_key, password=lambda: b"-"
+        ),
+    }
+    for path, read in readings.items():
+        what = "private key" if path == tls.private_key else "certificate"
+        try:
+            read()
+        except ssl.SSLError as error:  # also of a key that is of another certificate
+            why = (error.reason or "no such thing in it").replace("_", " ").lower()
+        except OSError as error:
+            why = error.strerror or str(error)
+        else:
+            continue
+        raise ConfigError(
+            f"{path} cannot be used as {what}: {why}",
+            remedy="name a folder as palpate certs issue makes it: palpate certs show FOLDER",
+        )
 
 
 _opened = False
@@ -155,6 +186,14 @@ def check_process() -> None:
         )
 
 
+_PLACE = re.compile(r" at /\S+\.rs:\d+\.?")
+
+
+def said(error: Exception) -> str:
+    """What Zenoh says of an error, without the places in its source."""
+    return _PLACE.sub("", str(error))
+
+
 class Declared(Closing):
     """What a session has declared: closed with it, and forgotten by it if it was closed before."""
 
@@ -174,7 +213,8 @@ def while_open() -> Iterator[None]:
         yield
     except zenoh.ZError as error:
         raise LinkError(
-            f"the session is closed, or Zenoh refuses: {error}", remedy="open the session again"
+            f"the session is closed, or Zenoh refuses: {said(error)}",
+            remedy="open the session again",
         ) from error
 
 
@@ -189,6 +229,7 @@ def open_zenoh(link: LinkConfig, mode: str, *, also_listen: Sequence[str] = ()) 
     Raises:
         LinkError: A port is in use, a client finds no router, or another session was opened before
             a fork.
+        ConfigError: Its certificates cannot be used.
     """
     global _opened
     check_process()
@@ -210,7 +251,7 @@ def open_zenoh(link: LinkConfig, mode: str, *, also_listen: Sequence[str] = ()) 
         if mode == "client":
             raise no_router(link) from error
         raise LinkError(
-            f"cannot join the bus: {error}", remedy="check the [link] table of the profile"
+            f"cannot join the bus: {said(error)}", remedy="check the [link] table of the profile"
         ) from error
 
 

@@ -49,11 +49,12 @@ class AsyncStream(Generic[M]):
         self._watch: Watch[M] | None = None
         self._opening: asyncio.Task[None] | None = None
         self._closed = False
+        self._ended = False
 
     @property
     def closed(self) -> bool:
         """Whether it has ended."""
-        return self._closed
+        return self._closed or self._ended
 
     @property
     def counters(self) -> dict[str, int]:
@@ -78,6 +79,8 @@ class AsyncStream(Generic[M]):
                 if self._items:
                     item = self._items.popleft()
                     break
+                if self._ended:
+                    raise StopAsyncIteration
                 self._arrived.clear()
             await self._arrived.wait()
         else:
@@ -94,7 +97,7 @@ class AsyncStream(Generic[M]):
 
     async def _open(self) -> None:
         def watch() -> Watch[M]:
-            return Watch(self._make(), self._offer, self._offer)
+            return Watch(self._make(), self._offer, self._offer, self._end)
 
         self._watch = await self._client.promptly(watch)
         if self._closed:  # meanwhile
@@ -111,10 +114,19 @@ class AsyncStream(Generic[M]):
                 self._skipped += len(self._items) == self._items.maxlen
                 self._items.append(item)
         if wake:
-            try:
-                self._loop.call_soon_threadsafe(self._arrived.set)
-            except RuntimeError:  # the loop is closed, and nobody waits any more
-                self._closed = True
+            self._wake()
+
+    def _end(self) -> None:
+        """The client was closed: nothing comes after what waits here."""
+        with self._lock:
+            self._ended = True
+        self._wake()
+
+    def _wake(self) -> None:
+        try:
+            self._loop.call_soon_threadsafe(self._arrived.set)
+        except RuntimeError:  # the loop is closed, and nobody waits any more
+            self._closed = True
 
     async def aclose(self) -> None:
         """End the iteration."""

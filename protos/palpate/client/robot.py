@@ -44,7 +44,7 @@ from palpate.client.simulations import (
     ask_cancellation,
     ask_simulation,
 )
-from palpate.client.streams import SameSensor, Stream, check_depth
+from palpate.client.streams import TURN_S, SameSensor, Stream, check_depth, is_cancelled
 from palpate.config import (
     STATION_VARIABLE,
     TlsConfig,
@@ -97,7 +97,7 @@ def _close_all() -> None:
 
 
 class Client(Closing):
-    """A robot's view of a station.
+    """A robot's view of a station. Open one and keep it: joining and leaving take time.
 
     Methods take the name of a ``sensor``, and as ``timeout_s`` how long an answer may take [s];
     None = the client's timeout.
@@ -128,7 +128,7 @@ class Client(Closing):
         self._lock = threading.Lock()
         # By topic and sensor, with a lock each: a subscriber belongs to one thread at a time.
         self._newest: dict[tuple[str, str], tuple[Subscriber[Any], SameSensor, threading.Lock]] = {}
-        self._unseen: dict[tuple[str, str], tuple[Subscriber[Any], SameSensor]] = {}
+        self._unseen: dict[tuple[str, str], tuple[Subscriber[Any], SameSensor, threading.Lock]] = {}
         self._streams: list[Stream[Any]] = []
         self._publishers: list[RobotPosePublisher] = []
         self._session = Session.open(
@@ -359,11 +359,26 @@ class Client(Closing):
         with self._lock:
             if key not in self._unseen:
                 made = session.subscriber(FEATURES, sensor=sensor)
-                self._unseen[key] = made, SameSensor(made.key)
-            subscriber, same = self._unseen[key]
-        received: ReceivedMessage[FeatureEstimate] = subscriber.next(timeout_s)
-        same.check(received.message)
-        return received
+                self._unseen[key] = made, SameSensor(made.key), threading.Lock()
+            subscriber, same, lock = self._unseen[key]
+        end_s = time.monotonic() + timeout_s
+        while not is_cancelled() and (left_s := end_s - time.monotonic()) > 0.0:
+            turn_s = min(left_s, TURN_S)
+            if not lock.acquire(timeout=turn_s):  # another thread waits for the same
+                continue
+            try:
+                received: list[ReceivedMessage[FeatureEstimate]] = subscriber.next_batch(
+                    turn_s, most=1
+                )
+            finally:
+                lock.release()
+            if received:
+                same.check(received[0].message)
+                return received[0]
+        raise StreamTimeout(
+            f"no features on {subscriber.key} within {timeout_s:g} s",
+            remedy="check that its publisher runs: palpate status",
+        )
 
     def robot_pose_publisher(self, robot: str) -> RobotPosePublisher:
         """A publisher of the poses of a robot's flange: call ``put`` from the control loop.
@@ -504,6 +519,7 @@ class Client(Closing):
             max_age_s=max_age_s,
             timeout_s=timeout_s,
             wall_clock_error_s=self.session.wall_clock_error_s,
+            client=self,
         )
         with self._lock:
             self._streams = [one for one in self._streams if not one.closed]
@@ -528,13 +544,13 @@ class Client(Closing):
                     message: M = subscriber.latest(max_age_s).message
                 except StaleError:
                     left_s = end_s - time.monotonic()
-                    if left_s <= 0.0:
+                    if left_s <= 0.0 or is_cancelled():
                         raise
                 else:
                     same.check(message)
                     return message
                 with contextlib.suppress(StreamTimeout):
-                    subscriber.next(left_s)
+                    subscriber.next(min(left_s, TURN_S))
 
 
 def _check_count(number: int, what: str) -> None:

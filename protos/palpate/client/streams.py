@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Generic, Self, TypeVar
 
 from palpate import clock
-from palpate.bus import ReceivedMessage, Subscriber
+from palpate.bus import Cancellation, ReceivedMessage, Subscriber
 from palpate.config import check_duration
 from palpate.errors import (
     ConfigError,
@@ -35,8 +35,8 @@ OnError = Callable[[PalpateError], None]
 
 _log = logging.getLogger(__name__)
 
-_TURN_S = 0.25
-"""How long a stream waits before it looks whether it has been closed [s]."""
+TURN_S = 0.25
+"""How long is waited before it is looked whether a stream was closed, a call cancelled [s]."""
 
 _SAY_AGAIN_S = 10.0
 """How often a failing callback is logged [s]; each failure is counted."""
@@ -52,6 +52,12 @@ def check_depth(depth: int) -> None:
     """
     if depth < 1:
         raise ConfigError(f"depth = {depth} keeps nothing", remedy="give 1 or more")
+
+
+def is_cancelled() -> bool:
+    """Whether the caller of what runs in this thread has left."""
+    current = Cancellation.current()
+    return current is not None and current.cancelled.is_set()
 
 
 class SameSensor:
@@ -97,6 +103,7 @@ class Stream(Closing, Generic[M]):
         max_age_s: Age of the oldest reading that is delivered [s]; inf = any.
         timeout_s: Longest silence [s]; None = it waits for ever.
         wall_clock_error_s: How far another host's wall clock may be from this one's [s].
+        client: Whose stream it is; it stays open while the stream is in use.
 
     Raises:
         ConfigError: A time is not positive.
@@ -109,7 +116,9 @@ class Stream(Closing, Generic[M]):
         max_age_s: float,
         timeout_s: float | None,
         wall_clock_error_s: float = clock.WALL_CLOCK_ERROR_S,
+        client: object = None,
     ) -> None:
+        self._client = client
         self._max_age_s = check_duration(max_age_s, "max_age_s", most=math.inf)
         self._timeout_s = (
             math.inf if timeout_s is None else check_duration(timeout_s, "timeout_s", most=math.inf)
@@ -145,7 +154,7 @@ class Stream(Closing, Generic[M]):
             if left_s <= 0.0:
                 raise stale or self._silence()
             try:
-                received = self._subscriber.next(min(left_s, _TURN_S))
+                received = self._subscriber.next(min(left_s, TURN_S))
                 self._check_age(received)
                 self._same.check(received.message)
             except StreamTimeout:
@@ -207,19 +216,25 @@ class Stream(Closing, Generic[M]):
 class Watch(Closing, Generic[M]):
     """Calls ``callback`` with each message of a stream, in a thread of its own.
 
-    An exception of the callback is logged and counted, and the stream goes on. ``on_error`` is
-    called in the same thread when the stream was silent or stale for its ``timeout_s``, and again
-    for each further one, and when another sensor is in its place; then, too, it goes on.
+    An exception of the callback, ``SystemExit`` too, is logged and counted, and the stream goes on.
+    ``on_end`` is called once, in the same thread, after the last message. ``on_error`` is called
+    in the same thread when the stream was silent or stale for its ``timeout_s``, and again for each
+    further one, and when another sensor is in its place; then, too, it goes on.
 
     ``counters``: those of the stream, ``called``, ``silences`` and ``callback_errors``.
     """
 
     def __init__(
-        self, stream: Stream[M], callback: Callable[[M], None], on_error: OnError | None = None
+        self,
+        stream: Stream[M],
+        callback: Callable[[M], None],
+        on_error: OnError | None = None,
+        on_end: Callable[[], None] | None = None,
     ) -> None:
         self._stream = stream
         self._callback = callback
         self._on_error = on_error
+        self._on_end = on_end
         self._counts: Counter[str] = Counter({"called": 0, "silences": 0, "callback_errors": 0})
         self._said_s = -math.inf
         self._thread = threading.Thread(target=self._run, name="palpate callback", daemon=True)
@@ -231,6 +246,11 @@ class Watch(Closing, Generic[M]):
         return {**self._stream.counters, **self._counts}
 
     def _run(self) -> None:
+        self._call_each()
+        if self._on_end is not None:
+            self._on_end()
+
+    def _call_each(self) -> None:
         while True:
             try:
                 message = next(self._stream)
@@ -255,7 +275,7 @@ class Watch(Closing, Generic[M]):
     def _call(self, function: Callable[[T], None], argument: T) -> None:
         try:
             function(argument)
-        except Exception:
+        except BaseException:
             # The user's code: nothing of it may end the stream, and nothing of it may vanish.
             self._counts["callback_errors"] += 1
             now_s = time.monotonic()

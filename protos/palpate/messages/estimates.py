@@ -247,6 +247,6 @@ class StageTimings:
 
 def as_field_frame(field: FieldFrame | FieldEstimate) -> FieldFrame:
     """A field without saying whether it is known or estimated; same stamp, sensor and mesh."""
-    if isinstance(field, FieldFrame):
-        return field
-    return FieldFrame(field.source, field.sensor_serial, field.mesh_sha256, field.displacement)
+    if isinstance(field, FieldEstimate):
+        return FieldFrame(field.source, field.sensor_serial, field.mesh_sha256, field.displacement)
+    return field
