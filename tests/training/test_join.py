@@ -98,7 +98,7 @@ def test_parts_that_do_not_fit_together_are_refused(large: MixedDataset, tmp_pat
         join_mixed([large, replace(large, experiment=own)], ["a", "b"], modes=2, force_modes=1)
 
     files = [tmp_path / folder / "mixed.h5" for folder in ("one", "two")]
-    elsewhere = large.experiment.location + np.float32([0.0, 0.003, 0.0])
+    elsewhere = large.experiment.location + np.array([0.0, 0.003, 0.0], np.float32)
     tared = large.experiment.tared * np.float32(1.1)
     unlike = replace(large.experiment, tared=tared, location=elsewhere)
     for file, one in zip(files, (large, replace(large, experiment=unlike)), strict=True):
@@ -173,7 +173,7 @@ def test_one_plan_on_two_specimens_is_held_out_together(
         large.experiment,
         unit_names=tuple(f"other-{name}" for name in large.experiment.unit_names),
         tared=large.experiment.tared * np.float32(1.1),
-        location=large.experiment.location + np.float32([0.0, 0.001, 0.0]),  # another robot
+        location=large.experiment.location + np.array([0.0, 0.001, 0.0], np.float32),
     )
     files = [tmp_path / "one.h5", tmp_path / "two.h5"]
     for file, one in zip(files, (large, replace(large, experiment=rows)), strict=True):

@@ -398,7 +398,7 @@ def contents(data: FeatureDataset, title: str) -> Table:
     """What a data set holds: arrays, units, ranges, provenance."""
     groups, blocks = len(np.unique(data.group)), len(np.unique(data.block))
     where = data.provenance
-    lines = [
+    lines: list[str | Text] = [
         f"{len(data)} rows, {groups} groups, {blocks} blocks, sensors"
         f" {', '.join(data.sensor_names)}",
         f"source: {where.source}",

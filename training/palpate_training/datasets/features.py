@@ -193,7 +193,7 @@ def refuse_same_presses(names: Sequence[str | Path], parts: Sequence[FeatureData
 
 
 def counts_under_force(
-    electrodes: CountArray, force: npt.NDArray[np.floating]
+    electrodes: npt.NDArray[np.number], force: npt.NDArray[np.floating]
 ) -> tuple[FloatArray, FloatArray]:
     """Raw counts as ``refuse_repeated`` compares them, whatever the force of a row is.
 
@@ -207,7 +207,7 @@ def counts_under_force(
     """
     works = ~at_an_end(electrodes).all(axis=1, keepdims=True)
     told = force.any(axis=1, keepdims=True) & works
-    return electrodes.astype(np.float32), told.astype(np.float32)
+    return electrodes.astype(np.float32), np.asarray(told, np.float32)
 
 
 NOMINAL_PERIOD_S = 0.01

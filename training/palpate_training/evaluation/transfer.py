@@ -125,7 +125,8 @@ def _in_time(data: FeatureDataset) -> FeatureDataset:
     order = np.argsort(data.time_ns, kind="stable")
     if np.count_nonzero(np.diff(piece[order])) > piece[-1]:
         return data
-    return replace(data, **{name: values[order] for name, values in data.arrays().items()})
+    columns: dict[str, Any] = {name: rows[order] for name, rows in data.arrays().items()}
+    return replace(data, **columns)
 
 
 def refuse_same(names: Sequence[str], fingers: Sequence[Finger]) -> None:
