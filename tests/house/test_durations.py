@@ -70,6 +70,6 @@ def test_only_whole_files_are_measured(
     monkeypatch.delattr(pytestconfig, "workerinput", raising=False)
     monkeypatch.setattr(pytestconfig, "args", [FILE])
     monkeypatch.setattr(pytestconfig.option, "record_durations", True)
-    monkeypatch.setattr(pytestconfig.option, option, value)
+    monkeypatch.setattr(pytestconfig.option, option, value, raising=False)  # without a cache no lf
     with pytest.raises(pytest.UsageError, match="measures whole files"):
         conftest.pytest_configure(pytestconfig)
