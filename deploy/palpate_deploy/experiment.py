@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.cluster import RayCluster
-from palpate.errors import ConfigError, DatasetError
+from palpate.errors import ConfigError, DatasetError, SimulationError
 from palpate_fem.calibration.runs import PlannedPath
 from palpate_fem.config import FingertipParameters
 from palpate_fem.electrodes.electronics import (
@@ -292,6 +292,7 @@ class FemSimulator:
         Raises:
             DatasetError: The store is another fingertip's or damaged, or the disk refuses.
             RemoteError: The solver does not start.
+            SimulationError: Trajectories failed or ran out of time; what ended otherwise is kept.
             ConfigError: There is no such device.
         """
         setup = WorkerSetup(DEFAULT_FACTORY, _mesh_options(spec), parameters_of(spec), 1)
@@ -346,8 +347,16 @@ class FemSimulator:
             )
             if report.stopped:
                 return False
-            ended = {early.name for early in report.early}
-            missing = {plan.name for plan in plans} - set(SimulationStore.open(store).ids()) - ended
+            missing = {plan.name for plan in plans} - SimulationStore.open(store).done()
+            failed = [early for early in report.early if early.name in missing]
+            if failed:
+                first = failed[0]
+                raise SimulationError(
+                    f"{len(failed)} of {len(plans)} trajectories failed, the first is "
+                    f"{first.name}: {first.reason or first.how}",
+                    remedy="run this again: it goes on; with fewer --workers if memory or time "
+                    "were short",
+                )
             if missing:  # claimed by a process that runs it still, or that was lost
                 raise DatasetError(
                     f"{len(missing)} of {len(plans)} trajectories are not in {store}: another "

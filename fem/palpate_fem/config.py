@@ -62,5 +62,6 @@ class FingertipParameters:
             if value is None or not math.isfinite(value) or not low <= value <= high:
                 raise ConfigError(
                     f"{name} = {value} is not within [{low:g}, {high:g}]",
-                    remedy="give it in SI units and within these limits",
+                    remedy="stay within these limits; they are in SI units here, in mm, kPa or ml "
+                    "as options",
                 )

@@ -28,8 +28,8 @@ from palpate.rigid import LEVER_M, facing, quaternions_of, rotation_matrices, un
 from palpate_fem.arrays import Floats
 from palpate_fem.indenter.approach import OuterSurface, first_contact
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
-from palpate_fem.indenter.distance import signed_distance
-from palpate_fem.indenter.path import POSES_MOST, PathSegment, check_path
+from palpate_fem.indenter.distance import TOUCH_M, signed_distance
+from palpate_fem.indenter.path import POSES_MOST, PathSegment, check_path, show_segments
 from palpate_fem.indenter.shape import Indenter
 from palpate_fem.mesh.surface import node_normals
 
@@ -178,7 +178,7 @@ def segment_path(
     Raises:
         ConfigError: A value is out of range, the first segment is not a press, or there are too
             many steps.
-        SimulationError: The first press passes the skin.
+        SimulationError: A press that counts from first contact passes the skin; names it.
     """
     if not (math.isfinite(step_m) and step_m > 0.0):
         raise ConfigError(f"step_m = {step_m} is not a length", remedy="give it in metres, > 0")
@@ -206,7 +206,13 @@ def segment_path(
                 moves.append(path)
             else:
                 at = moves[-1][-1]
-                way = _first_touch(indenter, at, direction, surface) + depth_m
+                touch = _first_touch(indenter, at, direction, surface)
+                if not -TOUCH_M <= touch < math.inf:
+                    raise SimulationError(
+                        f"{show_segments([segment])!r} passes the fingertip without touching it",
+                        remedy="slide back over the finger before it, or press more steeply",
+                    )
+                way = touch + depth_m
                 moves.append(_moved(at, way * direction, _steps(way, step_m)))
             clear = False
             continue
@@ -299,12 +305,12 @@ def _turns(axis: ArrayLike, angles: Floats) -> Floats:
 def _first_touch(indenter: Indenter, at: Floats, direction: Floats, surface: OuterSurface) -> float:
     """Way from a pose to first contact with the untouched skin [m]; negative from inside it.
 
-    An indenter that has slid beside the finger touches nothing: 0.
+    An indenter that has slid beside the finger touches nothing: infinite.
     """
     try:
         return first_contact(indenter, at[3:], at[:3], direction, surface)
     except SimulationError:
-        return 0.0
+        return math.inf
 
 
 _NEAR_TIP_M = 0.1e-3
@@ -473,8 +479,8 @@ def _straight_path(
 
     ``turn_rad`` is how far the indenter is turned about its axis.
     """
-    if steps < 1:
-        raise ConfigError(f"a path of {steps} steps", remedy="ask for at least one step")
+    if not 1 <= steps < POSES_MOST:  # before arrays are made of them
+        raise ConfigError(f"a path of {steps} steps", remedy=f"ask for 1 to {POSES_MOST - 1}")
     for what, value in (("depth_m", depth_m), ("clearance_m", clearance_m)):
         if not (math.isfinite(value) and value > 0.0):
             raise ConfigError(f"{what} = {value} is not a length", remedy="give it in metres, > 0")

@@ -22,7 +22,13 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.cluster import RayCluster, WorkerLostError
-from palpate.errors import ConfigError, DatasetError, LinkError, MissingExtraError
+from palpate.errors import (
+    ConfigError,
+    DatasetError,
+    LinkError,
+    MissingExtraError,
+    SimulationError,
+)
 from palpate.files.tape import read_tape
 from palpate_deploy.cli.data import twin_app
 from palpate_deploy.experiment import FemSimulator, specimens_of, with_indenters_met
@@ -46,7 +52,7 @@ from palpate_training.datasets.experiment import (
 )
 from palpate_training.datasets.export import features
 from palpate_training.datasets.features import joined
-from palpate_training.experiment.generate.fingertips import share_out
+from palpate_training.experiment.generate.fingertips import SharedExperiment, share_out
 from palpate_training.experiment.generate.pipeline import (
     EXPERIMENT,
     IDLE,
@@ -260,6 +266,42 @@ def test_what_another_process_has_claimed_is_not_left_out(
     with other, other.claim(name), pytest.raises(DatasetError, match=r"1 of 2 .* claimed"):
         simulate(("cpu",), 2)
     simulate(("cpu",), 2)  # the claim is gone
+
+
+DIES, HELD = 0.13, 0.22
+"""Of `fem_fakes`: friction with which a run ends its process, or goes on until its time is over."""
+
+
+@pytest.mark.parametrize(
+    ("friction", "limit_s", "said"), [(DIES, 600.0, "exit status 7"), (HELD, 0.5, "")]
+)
+def test_what_failed_or_ran_out_of_time_is_not_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, friction: float, limit_s: float, said: str
+) -> None:
+    """Else a data set of a part would look whole."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "fem"))
+    monkeypatch.setattr("palpate_deploy.experiment.DEFAULT_FACTORY", "fem_fakes:round_finger")
+    monkeypatch.setattr("palpate_deploy.experiment.LIMIT_S", limit_s)
+    first = "the first is sphere_medium/00/"
+    with pytest.raises(SimulationError, match=f"2 of 2 .* failed, {first}.*{said}"):
+        FemSimulator().simulate(
+            replace(SPEC, friction_coefficient=friction),
+            tmp_path / STORE,
+            workers=1,
+            threads=1,
+            stop=threading.Event(),
+            on_progress=lambda *_: None,
+        )
+
+
+def test_stopped_is_not_said_where_json_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SharedExperiment, "made", lambda *_: iter(()))
+    done = CliRunner().invoke(twin_app, ["generate", str(tmp_path / "twin"), "--json"])
+    assert done.exit_code == 1
+    assert done.stdout == ""
+    assert "stopped" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from palpate.errors import ConfigError, DatasetError, SimulationError
 from palpate.rigid import path_lengths
@@ -27,6 +30,7 @@ from palpate_fem.calibration.settings import (
     VOLUME,
     CalibrationSettings,
 )
+from palpate_fem.cli.app import fem_app
 from palpate_fem.config import FingertipParameters
 from palpate_fem.plot.validation import plot_calibration
 from palpate_fem.result import IndentationOutcome
@@ -370,9 +374,36 @@ def test_result_is_a_file_that_gives_the_parameters_back(tmp_path: Path) -> None
     assert read_parameters(path).fluid_volume_m3 is None
     content["parameters"]["shear_modulus_pa"] = None
     path.write_text(json.dumps(content))
-    with pytest.raises(ConfigError, match="shear_modulus_pa = None"):
+    with pytest.raises(ConfigError, match=r"fit\.json: shear_modulus_pa = None"):
         read_parameters(path)
     path.write_text(path.read_text().replace("palpate.calibration", "other"))
     for bad in (path, tmp_path / "nothing.json", picture):
         with pytest.raises(ConfigError, match="not a calibration"):
             read_parameters(bad)
+
+
+def test_json_of_a_recovery_that_fails_is_json(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Deviations are infinite there, and a value that was not found is none."""
+    found = recover(Formula(), TRUTH, PLANS[:2], 0.02, 5)
+    failed = replace(
+        found,
+        found=found.found | {MODULUS: math.nan},
+        sd=dict.fromkeys(found.sd, math.inf),
+    )
+    bar = SimpleNamespace(on_evaluation=None, on_run=None)
+    command = "palpate_fem.cli.identify"
+    monkeypatch.setattr(f"{command}.biotac", lambda **_: None)
+    monkeypatch.setattr(f"{command}.Fingertip.pressurised", lambda *_: None)
+    monkeypatch.setattr(f"{command}.plan_recovery", lambda _: [])
+    monkeypatch.setattr(f"{command}.simulator_for", lambda *_: nullcontext((None, None, bar)))
+    monkeypatch.setattr(f"{command}.recover", lambda *_, **__: failed)
+    done = CliRunner().invoke(fem_app, ["recover", "--json"])
+    assert done.exit_code == 1
+    told = json.loads(done.stdout, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert told["found"][MODULUS] is None
+    assert set(told["deviation"].values()) == {None}
+
+
+def test_infinite_noise_is_refused() -> None:
+    with pytest.raises(ConfigError, match="--noise-n inf is not finite"):
+        CliRunner().invoke(fem_app, ["recover", "--noise-n", "inf"], catch_exceptions=False)

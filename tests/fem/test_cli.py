@@ -308,13 +308,17 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
         (("--angle-deg", 90), "angle-deg"),
         (("--indenter", "cube", "--indenter", "ring"), "several"),
         (("--shear-modulus-kpa", 280_000), "shear_modulus_pa"),
+        (("--skin-thickness-mm", 1.57e-3), "in mm, kPa or ml as options"),
         (("--strain-stiffening", 0.5), "strain_stiffening"),
         (("--mesh", "nowhere"), "nowhere"),
         (("--poses", "nowhere.csv"), "nowhere.csv"),
         (("--path", "nowhere.csv"), "--poses"),
         (("--path", "pres 1 mm"), "pres 1 mm"),
         (("--path", "press 1 mm", "--poses", "a.csv"), "exclude"),
-        (("--path", "press 1 mm", "--step-mm", 0), "step_m"),
+        (("--path", "press 1 mm", "--step-mm", 0), "--step-mm 0 is no length"),
+        (("--depth-mm", -1), "--depth-mm -1 is no length"),
+        (("--steps", 10**12), "--steps 1000000000000: at most 10,000 poses"),
+        (("--sweep", "--store", "a.sim", "--steps", 10_000), "--steps 10000: at most"),
         (("--path", "press 1 mm, slide 20 mm towards +y", "--step-mm", 0.001), "poses"),
         (("--parameters", "nowhere.json"), "nowhere.json"),
         (("--at-mm", 40, 0), "no pad"),
@@ -339,8 +343,9 @@ def test_an_early_end_is_listed(kind: str, code: int, said: str) -> None:
     ],
 )
 def test_what_cannot_be_meant_is_refused(words: tuple[object, ...], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError) as caught:
         fem("run", *words)
+    assert said in f"{caught.value.problem}; {caught.value.remedy}"
 
 
 TRUTH = FingertipParameters(
@@ -504,6 +509,17 @@ def test_a_stopped_sweep_keeps_what_has_ended(stop: signal.Signals, tmp_path: Pa
     assert "Traceback" not in errors
     assert "ended by" not in errors
     assert SimulationStore.open(store).check() >= 1
+
+
+def test_json_of_what_is_stopped_before_the_finger_is_filled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("palpate_fem.service.batch.SimulationBatch.fingertip", lambda *_: None)
+    done = fem("run", "--workers", 1, "--json")
+    assert done.exit_code == 1
+    told = json.loads(done.stdout)
+    assert told["stopped"]
+    assert told["fingertip"] is None
 
 
 def test_serve_answers_until_it_is_told_to_stop(link: LinkConfig) -> None:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 
 from palpate.errors import ConfigError
 from palpate_fem.cli.app import fem_app
-from palpate_fem.verify import PUBLIC_SKIN
+from palpate_fem.verify import PUBLIC_SKIN, suite
 from palpate_fem.verify.check import (
     Measurement,
     MissingDataError,
@@ -90,6 +90,13 @@ def test_no_such_check() -> None:
     assert verify("--only", "patch").exit_code == 0
     with pytest.raises(ConfigError, match="nonsense"):
         verify("--only", "nonsense")
+
+
+def test_a_check_that_is_only_slow_is_not_said_to_be_missing() -> None:
+    (slow, *_) = set(suite()) - set(suite(quick=True))
+    with pytest.raises(ConfigError, match="take minutes") as caught:
+        verify("--only", slow.name)
+    assert caught.value.remedy == "add --slow"
 
 
 def test_the_public_mesh_may_lie_elsewhere(tmp_path: Path, asked: list[Path | None]) -> None:

@@ -92,6 +92,7 @@ def test_an_angled_direction_exists_everywhere_even_at_the_very_tip() -> None:
         ({"depth_m": math.nan}, "depth_m = nan"),
         ({"clearance_m": -1e-3}, "clearance_m"),
         ({"steps": 0}, "0 steps"),
+        ({"steps": 10**12}, "1000000000000 steps"),
         ({"target": [0.0, math.nan, 0.0]}, "target"),
         ({"direction": [0.0, 0.0, 0.0]}, "not a direction"),
     ],
@@ -346,8 +347,23 @@ def test_after_unloading_a_press_counts_from_contact_again() -> None:
 
 
 def test_a_slide_off_the_finger_can_unload() -> None:
-    path = path_of("press 0.5 mm, slide 16 mm towards +y, unload, press 1 mm")
+    path = path_of("press 0.5 mm, slide 16 mm towards +y, unload")
     assert path[-1, 1] == pytest.approx(16e-3)
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        "press 0.5 mm, slide 16 mm towards +y",  # it lies behind, or nowhere
+        "press 0.5 mm, slide 16 mm towards +y, unload",
+        "press 0.5 mm, unload, slide 5 mm towards +y",
+    ],
+)
+def test_a_later_press_that_passes_the_finger_is_refused(before: str) -> None:
+    """It would go through air and come to its end without force."""
+    passes = "press 0.5 mm at 75 deg towards 90 deg"
+    with pytest.raises(SimulationError, match=f"{passes}' passes the fingertip"):
+        path_of(f"{before}, {passes}", "sphere_small")
 
 
 @pytest.mark.parametrize("step_m", [1e-8, 1e-300, 0.0, math.nan, math.inf])

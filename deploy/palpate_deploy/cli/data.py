@@ -292,7 +292,7 @@ def data_generate(
             elif not as_json:
                 typer.echo(f"{out / share.name}: was finished before")
     if len(found) < len(shares):
-        typer.echo(f"stopped; {out} keeps what is done: run the command again to go on")
+        typer.echo(f"stopped; {out} keeps what is done: run the command again to go on", err=True)
         raise typer.Exit(1)
     summaries = [found[share.name] for share in shares]
     if as_json:

@@ -181,6 +181,8 @@ def read_parameters(path: Path) -> FingertipParameters:
         if (content["schema"], content["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
             raise KeyError("schema")
         return FingertipParameters(**content["parameters"])
+    except ConfigError as error:  # of a value
+        raise ConfigError(f"{path}: {error.problem}", remedy=error.remedy) from error
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
         raise ConfigError(
             f"{path}: not a calibration of schema {SCHEMA} {SCHEMA_VERSION} ({error!r})",

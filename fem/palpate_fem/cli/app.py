@@ -60,7 +60,10 @@ FrictionOption = Annotated[
 ]
 FillOption = Annotated[
     float | None,
-    typer.Option("--fill-ml", help="Fluid under the skin [ml]; none = until it is 15.1 mm thick."),
+    typer.Option(
+        "--fill-ml",
+        help="Fluid under the skin [ml]; none = as the parameters say, or until 15.1 mm thick.",
+    ),
 ]
 WorkersOption = Annotated[
     int, typer.Option("--workers", min=0, help="Solver processes; 0 = one for each core.")

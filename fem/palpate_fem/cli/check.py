@@ -49,12 +49,21 @@ def verify_command(*, only: str | None, slow: bool, shared_data: Path | None, as
 
         run(only=only or "", slow=slow, shared_data=shared_data, on_check=on_check)
     if not checks:
-        raise ConfigError(f"no check has {only!r} in its name", remedy="leave out --only")
+        raise _no_check(only or "")
     if as_json:
         typer.echo(json.dumps(without_nan([asdict(check) for check in checks]), indent=1))
     else:
         _show_checks(checks)
     return 0 if all(check.passed for check in checks) else 1
+
+
+def _no_check(only: str) -> ConfigError:
+    """Why no check with this word in its name was run."""
+    from palpate_fem.verify import suite
+
+    if suite(only=only):
+        return ConfigError(f"the checks with {only!r} take minutes", remedy="add --slow")
+    return ConfigError(f"no check has {only!r} in its name", remedy="leave out --only")
 
 
 def bench_command(*, edge_mm: float | None, layers: int, as_json: bool) -> None:

@@ -27,7 +27,12 @@ from palpate.files.outputs import check_folder, check_output
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, recover
-from palpate_fem.calibration.result import Calibration, Evaluation, write_calibration
+from palpate_fem.calibration.result import (
+    Calibration,
+    Evaluation,
+    without_nan,
+    write_calibration,
+)
 from palpate_fem.calibration.runs import FingertipSimulator, simulate_all
 from palpate_fem.calibration.settings import CalibrationSettings
 from palpate_fem.cli.model import FingertipModel, workers_for
@@ -245,6 +250,8 @@ def recover_command(
 
     Of the model only the mesh is used.
     """
+    if not math.isfinite(noise_n):
+        raise ConfigError(f"--noise-n {noise_n:g} is not finite", remedy="give newtons, 0 or more")
     geometry = biotac(
         thickness_m=PLANTED.skin_thickness_m, edge_m=EDGE_M if edge_mm is None else edge_mm * 1e-3
     )
@@ -262,7 +269,8 @@ def recover_command(
             on_run=bar.on_run,
         )
     if as_json:
-        typer.echo(json.dumps(_recovery_json(recovery, noise_n, seed), indent=1))
+        content = without_nan(_recovery_json(recovery, noise_n, seed))
+        typer.echo(json.dumps(content, indent=1, allow_nan=False))
     else:
         title = f"planted and found, noise {noise_n:g} N, seed {seed}"
         print_table(RECOVERY_HEADINGS, recovery.rows(), title=title)

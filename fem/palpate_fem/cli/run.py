@@ -29,7 +29,7 @@ from palpate_fem.cli.model import FingertipModel, workers_for
 from palpate_fem.cli.terminal import console, print_lines, print_table, progress_bar, stop_on_signal
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.indenter.outline import outline_of
-from palpate_fem.indenter.path import parse_segments, read_path
+from palpate_fem.indenter.path import POSES_MOST, parse_segments, read_path
 from palpate_fem.result import IndentationOutcome, IndentationResult, IndentationStep
 from palpate_fem.service.batch import (
     FAILED,
@@ -129,6 +129,15 @@ class RunOptions:
             if not all(map(math.isfinite, values)):
                 given = " ".join(f"{value:g}" for value in values)
                 raise ConfigError(f"{name} {given} is not finite", remedy="give finite numbers")
+        for name in ("--depth-mm", "--step-mm"):
+            (length_mm,) = numbers[name]
+            if length_mm <= 0.0:
+                raise ConfigError(f"{name} {length_mm:g} is no length", remedy="give more than 0")
+        if self.steps >= POSES_MOST:
+            raise ConfigError(
+                f"--steps {self.steps}: at most {POSES_MOST:,} poses are simulated",
+                remedy=f"give 1 to {POSES_MOST - 1}",
+            )
         ways = {"--sweep": self.sweep, "--path": self.path, "--poses": self.poses}
         chosen = [name for name, value in ways.items() if value]
         if len(chosen) > 1:
@@ -257,6 +266,9 @@ def run_command(options: RunOptions, model: FingertipModel, *, workers: int) -> 
         task = bar.add_task("pressurise", total=None)
         fingertip = batch.fingertip(stop)
         if fingertip is None:
+            if options.as_json:
+                stopped = BatchReport(0, stopped=True)
+                write_json(None, [], stopped, 0, options.places, elsewhere=0)
             return 1
         bar.update(task, description="plan")
         plans = options.plans(fingertip)
@@ -501,7 +513,7 @@ def show_report(
 
 
 def write_json(
-    fingertip: StoredFingertip,
+    fingertip: StoredFingertip | None,
     trajectories: Sequence[Mapping[str, Any]],
     report: BatchReport,
     present: int,
@@ -509,9 +521,11 @@ def write_json(
     *,
     elsewhere: int,
 ) -> None:
-    """Print everything except nodal fields as JSON on stdout."""
+    """Print everything except nodal fields as JSON on stdout; a fingertip as null if none is."""
     content = {
-        "fingertip": {
+        "fingertip": None
+        if fingertip is None
+        else {
             "mesh": fingertip.mesh.name,
             "mesh_sha256": fingertip.mesh.sha256.hex(),
             "nodes": len(fingertip.mesh.nodes),

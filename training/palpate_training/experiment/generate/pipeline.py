@@ -119,6 +119,7 @@ def generate(
         ConfigError: The folder holds another experiment, or there are no such devices.
         LinkError: No cluster answers.
         DatasetError: What is there is damaged, or the disk refuses.
+        SimulationError: Trajectories failed; run again, it goes on.
         MissingExtraError: The training extra is not installed.
     """
     for module in ("pinocchio", "threadpoolctl"):  # of trials; told before hours of mechanics

@@ -333,6 +333,10 @@ class TwinSimulator(Protocol):
 
         Returns:
             Whether all is there; False = stopped.
+
+        Raises:
+            SimulationError: Some failed; run again, it goes on.
+            DatasetError: Another process has claimed some, or the store is damaged.
         """
 
     def open_store(self, path: Path) -> IndentationStore:
