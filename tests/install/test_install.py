@@ -257,6 +257,21 @@ def test_upgrade_keeps_data_and_rollback_restores_every_byte(
     assert all(file.read_text() == "data" for file in data)
 
 
+def test_profile_that_stays_is_known_again_whichever_install_wrote_it(
+    root: Path, profile: Path, install: Install
+) -> None:
+    for seed in range(8):
+        profile.write_text(VIRTUAL.replace("seed = 7", f"seed = {seed}"))
+        install()
+        installed = contents(root)
+        service.uninstall("lab", root, purge=False)
+        profile.write_text(VIRTUAL.replace("seed = 7", "seed = 99"))
+        install()
+        profile.write_text(VIRTUAL.replace("seed = 7", f"seed = {seed}"))
+        install()
+        assert difference(installed, contents(root)) in ([], ["~ /etc/palpate/installed/lab.json"])
+
+
 def test_same_again_changes_nothing_and_can_still_be_rolled_back(
     root: Path, install: Install, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -507,6 +522,31 @@ def test_router_for_other_hosts_needs_to_know_which(
         install(tmp_path / "lab.toml", allowed=("everyone",))
 
 
+def test_page_for_other_hosts_needs_to_know_which(
+    root: Path, tmp_path: Path, install: Install
+) -> None:
+    (tmp_path / "lab.toml").write_text('[web]\nlisten = "0.0.0.0:7480"\n')
+    install(tmp_path / "lab.toml")  # it has no page
+    (tmp_path / "lab.toml").write_text(
+        'processes = ["router", "gateway", "web"]\n[web]\nlisten = "0.0.0.0:7480"\n'
+    )
+    with pytest.raises(ConfigError, match=r"tcp/0\.0\.0\.0:7480 is there for other hosts"):
+        install(tmp_path / "lab.toml")
+
+
+def test_router_of_a_station_reaches_its_site(root: Path, tmp_path: Path, install: Install) -> None:
+    text = (
+        '[router]\nlisten = ["tls/127.0.0.1:7447"]\nconnect = ["tls/192.168.1.2:7447"]\n'
+        '[link]\ncertificates = "/pki"\n'
+    )
+    (tmp_path / "lab.toml").write_text(text)
+    install(tmp_path / "lab.toml")
+    assert "IPAddressAllow=localhost 192.168.1.2" in (root / UNIT).read_text("utf-8")
+    (tmp_path / "lab.toml").write_text(text.replace("192.168.1.2", "site.lab"))
+    with pytest.raises(ConfigError, match="'site.lab' is a name"):
+        install(tmp_path / "lab.toml")
+
+
 def test_certificates_by_role_are_handed_over_by_systemd(
     root: Path, tmp_path: Path, install: Install
 ) -> None:
@@ -676,6 +716,25 @@ def test_rollback_to_a_program_that_is_another_one_by_now_is_refused(
     program.write_text(f"#!/bin/sh\necho palpate {present_version()}\n")
     service.roll_back("lab", root)
     assert str(program) in (root / UNIT).read_text("utf-8")
+
+
+def test_rollback_enables_a_unit_that_comes_back(
+    root: Path, tmp_path: Path, profile: Path, install: Install, this_host: Path
+) -> None:
+    program = tmp_path / "palpate"
+    program.write_text(f"#!/bin/sh\necho palpate {present_version()}\n")
+    program.chmod(0o755)
+    profile.write_text(VIRTUAL.replace('"recorder"', '"recorder", "fem"'))
+    install(program=str(program))
+    profile.write_text('station = "lab"\nprocesses = ["fem"]\n')
+    install(program=str(program))
+    enable = "systemctl enable --quiet palpate@lab.service"
+    this_host.write_text("")
+    service.roll_back("lab", root)
+    assert enable in this_host.read_text()
+    this_host.write_text("")
+    service.roll_back("lab", root)
+    assert enable not in this_host.read_text()
 
 
 def test_wish_to_start_with_the_host_goes_too(root: Path, install: Install) -> None:

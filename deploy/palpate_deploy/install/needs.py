@@ -82,7 +82,11 @@ def needs_of(profile: Profile, allowed: Sequence[str] = ()) -> HostNeeds:
             can = can or (options.get("interface") == "socketcan" and bool(options.get("channel")))
             serial += [text for _, text in _texts(options, "") if text.startswith("/dev/")]
             devices += _networks_of(options, f"sensor {sensor.name!r}")
-    links = {"link": profile.link.connect, "ros_bridge": (profile.ros_bridge.connect,)}
+    links = {
+        "link": profile.link.connect,
+        "router": profile.router.connect,
+        "ros_bridge": (profile.ros_bridge.connect,),
+    }
     for table, endpoints in links.items():
         if table == "link" or table in profile.processes:
             networks += _networks_of({table: list(endpoints)}, f"[{table}]")
@@ -110,6 +114,8 @@ def _check_listeners(profile: Profile, networks: list[str]) -> None:
     listeners = list(profile.link.listen)
     if "router" in profile.processes:
         listeners += profile.router.listen
+    if "web" in profile.processes:
+        listeners.append(f"tcp/{profile.web.listen}")
     exposed = [one for one in listeners if not is_loopback(endpoint_host_port(one)[0])]
     if exposed and not networks:
         raise ConfigError(

@@ -136,10 +136,13 @@ def roll_back(name: str, root: Path) -> None:
         _check_nothing_in_the_way(host, old, old.before.texts, None)
         if host.is_this_host:
             _check_runs(old.before)
-        _change(books, Ledger(now=old.before, before=old.now), "")
+        main, *_ = (path for path in old.before.texts if path.endswith(".service"))
+        unit = Path(main).name
+        # One that was there may have been disabled by a person.
+        enable = "" if main in old.now.texts else unit
+        _change(books, Ledger(now=old.before, before=old.now), enable)
         print(f"  palpate {old.before.palpate} again, by {old.before.program}")
-        units = [Path(path).name for path in old.before.texts if path.endswith(".service")]
-    print(f"next: systemctl restart {units[0]}")
+    print(f"next: systemctl restart {unit}")
 
 
 def uninstall(name: str, root: Path, *, purge: bool) -> int:
@@ -294,7 +297,9 @@ def _remove_files(host: Host, name: str, ledger: Ledger, *, purge: bool) -> dict
             file.unlink()
             print(f"removed {path}")
         else:
-            kept[path] = next(iter(written))
+            # What lies there, if an install wrote it: the profile of an older one may.
+            ours = (text for text in written if host.look(path, {text}) is Found.OURS)
+            kept[path] = next(ours, next(iter(written)))
             print(f"kept    {path}" + ("" if found is Found.OURS else f" ({found.value})"))
     return kept
 
