@@ -129,6 +129,16 @@ def test_router_that_nobody_can_reach_is_refused(tmp_path: Path, listen: str, sa
         load_profile(_write(tmp_path, f"[router]\nlisten = {listen}"))
 
 
+def test_all_addresses_and_one_of_them_exclude_each_other(tmp_path: Path) -> None:
+    """The router could not bind the second one, and would never start."""
+    two = '["tls/127.0.0.1:7447", "tls/0.0.0.0:7447"]'
+    text = f'[router]\nlisten = {two}\n[link]\ncertificates = "/pki"\n'
+    with pytest.raises(ConfigError, match="all addresses") as caught:
+        load_profile(_write(tmp_path, text))
+    assert "leave the other one out" in caught.value.remedy
+    load_profile(_write(tmp_path, text.replace("0.0.0.0:7447", "192.168.1.2:7447")))
+
+
 def test_router_port_is_said_once(tmp_path: Path) -> None:
     """Who starts the router connects to it, unless told otherwise."""
     path = _write(tmp_path, '[router]\nlisten = ["tcp/127.0.0.1:9000"]')

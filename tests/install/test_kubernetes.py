@@ -30,7 +30,7 @@ processes = ["router", "fem", "features"]
 certificates = "/etc/palpate/certs"
 
 [router]
-listen = ["tls/127.0.0.1:7447", "tls/0.0.0.0:7447"]
+listen = ["tls/0.0.0.0:7447"]
 
 [fem]
 workers = 2
@@ -126,9 +126,8 @@ def test_selectors_and_names_meet(written: dict[str, list[dict[str, Any]]]) -> N
         ('"fem", "features"', '"gateway"', "gateway cannot run in a cluster"),
         ('"fem", "features"', '"metrics"', "metrics cannot run in a cluster"),
         ('["router", "fem", "features"]', '["fem"]', "router of its own"),
-        ('certificates = "/etc/palpate/certs"', "", "needs certificates"),
-        ('listen = ["tls/127.0.0.1:7447", "tls/0.0.0.0:7447"]', 'listen = ["tls/127.0.0.1:7447"]',
-         "loopback only"),
+        ('certificates = "/etc/palpate/certs"', "", "without mutual TLS"),
+        ('listen = ["tls/0.0.0.0:7447"]', 'listen = ["tls/127.0.0.1:7447"]', "loopback only"),
     ],
 )  # fmt: skip
 def test_what_does_not_belong_there_is_refused(
@@ -158,7 +157,7 @@ def test_the_probes_tell_the_living_from_the_hung(
     for role in Role:
         issue(certificates, role)
     text = PROFILE.replace("/etc/palpate/certs", str(certificates))
-    text = text.replace('"tls/127.0.0.1:7447", "tls/0.0.0.0:7447"', f'"tls/127.0.0.1:{port}"')
+    text = text.replace("tls/0.0.0.0:7447", f"tls/0.0.0.0:{port}")
     profile = tmp_path / "here.toml"
     profile.write_text(text, encoding="utf-8")
     container = dict(pods(written))["router"]["containers"][0]

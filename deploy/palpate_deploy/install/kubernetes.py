@@ -111,7 +111,7 @@ def _exposed(profile: Profile) -> str:
             return endpoint
     raise ConfigError(
         "the router listens on loopback only, which no other pod and no station reaches",
-        remedy='[router] listen = ["tls/127.0.0.1:7447", "tls/0.0.0.0:7447"]',
+        remedy='[router] listen = ["tls/0.0.0.0:7447"]',
     )
 
 

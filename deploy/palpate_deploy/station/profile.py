@@ -402,6 +402,13 @@ def _check_router(profile: Profile, where: str) -> None:
                 f"tcp/{endpoint.partition('/')[2]}",
             )
     own = {endpoint_host_port(endpoint) for endpoint in profile.router.listen}
+    for host, port in sorted(own):
+        if host in ("0.0.0.0", "::") and sum(other == port for _, other in own) > 1:
+            raise ConfigError(
+                f"{where}: router.listen names port {port} at {host}, which is all addresses, and "
+                "at another one",
+                remedy="leave the other one out",
+            )
     for endpoint in profile.router.connect:
         if profile.link.has_roles and not endpoint.startswith("tls/"):
             raise ConfigError(
