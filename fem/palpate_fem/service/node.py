@@ -19,6 +19,7 @@ from typing import Any
 
 from palpate import __version__
 from palpate.bus import Presence, Publisher, QueryAnswer, SensorClaims, Session, endpoints
+from palpate.bus.presence import GoneCallers
 from palpate.bus.queryable import Queryable
 from palpate.bus.topics import SIMULATION_PROGRESS, caller_key, duty_root
 from palpate.config import LinkConfig
@@ -71,7 +72,6 @@ _CLAIM_S = 1.0
 """A key that is free is claimed within this time [s]."""
 
 _FINGERTIPS_KNOWN = 16
-_GONE_KNOWN = 1024
 _REFUSED = (ErrorCode.INVALID_REQUEST, ErrorCode.RESOURCE_EXHAUSTED, ErrorCode.UNAVAILABLE)
 
 
@@ -212,7 +212,7 @@ class SimulationService(Closing):
         self._health = health
         self._lock = threading.Lock()
         self._active: dict[str, ActiveSimulation] = {}
-        self._gone_s: OrderedDict[str, float] = OrderedDict()
+        self._gone = GoneCallers()
         self._fingertips: OrderedDict[FingertipParameters, StoredFingertip] = OrderedDict()
         self._progress = session.publisher(SIMULATION_PROGRESS, sensor=config.sensor)
         self.pool = _pool_of(config, default, device, self._remember)
@@ -244,7 +244,7 @@ class SimulationService(Closing):
                 self._forget(active)
                 raise
             key = caller_key(self._station, request.request_id)
-            if (gone_s := self._gone_s.get(key)) is not None:  # while the question waited
+            if (gone_s := self._gone.since(key)) is not None:  # while the question waited
                 self.caller_gone(key, gone_s)
         except PalpateError as error:
             if error.code in _REFUSED:
@@ -263,10 +263,8 @@ class SimulationService(Closing):
             when_s: When it vanished [s, monotonic]; a request with the same id that arrives later
                 is another call.
         """
+        self._gone.add(key, when_s)
         with self._lock:
-            self._gone_s[key] = when_s
-            if len(self._gone_s) > _GONE_KNOWN:
-                self._gone_s.popitem(last=False)
             ids = [
                 name
                 for name, active in self._active.items()

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 from palpate.bus import QueryAnswer
+from palpate.bus.presence import GoneCallers
 from palpate.bus.topics import caller_key
 from palpate.errors import ErrorCode, PalpateError, RemoteError
 
@@ -25,7 +25,6 @@ MOST = 8
 """So many requests may wait for the readings of one sensor."""
 
 _RETRY_LEAST_S = 0.1
-_GONE_KNOWN = 1024
 
 R = TypeVar("R")
 
@@ -55,7 +54,7 @@ class SensorRequests(Generic[R]):
         self._rate_hz = rate_hz
         self._lock = threading.Lock()
         self._waiting: list[_Waiting[R]] = []
-        self._gone_s: OrderedDict[str, float] = OrderedDict()
+        self._gone = GoneCallers()
 
     def check_count(self, count: int, *, least: int, usual: int) -> int:
         """The number of readings that a request wants; 0 means ``usual``, which is always allowed.
@@ -114,7 +113,7 @@ class SensorRequests(Generic[R]):
             expected_s = max([now_s, *before]) + readings / self._rate_hz
             one = _Waiting(caller, answer.arrived_ns * 1e-9, expected_s, begin())
             self._waiting.append(one)
-        if (gone_s := self._gone_s.get(caller)) is not None:  # while the question waited
+        if (gone_s := self._gone.since(caller)) is not None:  # while the question waited
             self.caller_gone(caller, gone_s)
         # A thread for each: a caller whose link is stuck holds up no other, least of all the
         # thread that reads the sensor.
@@ -127,10 +126,8 @@ class SensorRequests(Generic[R]):
 
     def caller_gone(self, caller: str, when_s: float) -> None:
         """Drop the requests of a caller whose token vanished at ``when_s`` [s, monotonic]."""
+        self._gone.add(caller, when_s)
         with self._lock:
-            self._gone_s[caller] = when_s
-            if len(self._gone_s) > _GONE_KNOWN:
-                self._gone_s.popitem(last=False)
             gone = [one for one in self._waiting if one.caller == caller and one.since_s <= when_s]
         for one in gone:
             one.future.cancel()

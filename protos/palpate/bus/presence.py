@@ -6,6 +6,7 @@ import contextlib
 import queue
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from palpate.bus.zenoh_session import Declared
 from palpate.process import Closing
 
 _LOOK_S = 1.0
+_GONE_KNOWN = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,3 +141,23 @@ class CallerWatch(Declared):
         self._subscriber.undeclare()
         self._vanished.put(None)
         self._worker.join(timeout=2)
+
+
+class GoneCallers:
+    """Callers that have left: a question may wait while its caller does. Safe in all threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._gone_s: OrderedDict[str, float] = OrderedDict()
+
+    def add(self, key: str, when_s: float) -> None:
+        """Remember what ``CallerWatch`` tells; of very many the first ones are forgotten."""
+        with self._lock:
+            self._gone_s[key] = when_s
+            if len(self._gone_s) > _GONE_KNOWN:
+                self._gone_s.popitem(last=False)
+
+    def since(self, key: str) -> float | None:
+        """When the token of this key vanished [s, monotonic]; None = not that anybody knows."""
+        with self._lock:
+            return self._gone_s.get(key)
