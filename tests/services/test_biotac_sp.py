@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -99,7 +100,6 @@ def test_features_service_names_the_sensor_and_serves_the_others(
             assert (got.sensor, got.message.source.sequence) == ("finger", sequence)
         until(lambda: robot.status()[0].counters.get("wrong_sensor") == 3)
         (status,) = robot.status()
-        assert status.state is ServiceState.READY
         assert status.sensors == ("finger",)
         assert status.last_error is not None
         assert "sensor 'thumb' is a BIOTAC_SP with 24 electrodes" in status.last_error.message
@@ -109,6 +109,14 @@ def test_features_service_names_the_sensor_and_serves_the_others(
         subscribed = robot.session.subscriber(ELECTRODES, sensor="thumb", delivery=Delivery.QUEUE)
         thumb.put(make_frame(4, sensor_type=SP))
         assert subscribed.next(5.0).message.electrodes.shape == (24,)
+        # A service that refuses all of a sensor says so until somebody chooses what it serves.
+        later = itertools.count(5)
+        until(lambda: thumb.put(make_frame(next(later), sensor_type=SP)) is None
+              and robot.status()[0].state is ServiceState.DEGRADED)  # fmt: skip
+        error = robot.status()[0].last_error
+        assert error is not None
+        assert "everything of sensor 'thumb' is refused" in error.message
+        assert "sensors = [...]" in error.remedy
 
 
 def test_field_service_answers_by_an_error(

@@ -364,6 +364,18 @@ def test_a_damaged_memory_is_a_problem_and_no_other_bundle(
     assert of(service()) == "x:1"
 
 
+def test_after_a_damaged_memory_the_profile_counts_for_all_others(
+    service: Service, tmp_path: Path
+) -> None:
+    (tmp_path / "served.json").write_text("{")
+    do(service(bundle="x:1", bundles={"thumb": "x:2"}), LOAD, "y:1", "finger")
+    again = service(bundle="x:1", bundles={"thumb": "x:2"})
+    assert again.problem is None
+    assert [of(again, sensor) for sensor in ("finger", "thumb", "any")] == ["y:1", "x:2", "x:1"]
+    do(again, UNLOAD, "", "thumb")
+    assert of(service(bundle="x:1", bundles={"thumb": "x:2"}), "thumb") == "x:1"
+
+
 def test_a_change_that_cannot_be_remembered_says_so(
     service: Service, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

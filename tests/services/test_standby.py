@@ -36,9 +36,10 @@ def replica(link: LinkConfig, until: Until) -> Replica:
     """Run a features service of this instance while the block runs."""
 
     @contextmanager
-    def running(instance: str, bundle: Path) -> Iterator[threading.Event]:
+    def running(instance: str, bundle: Path, **more: Any) -> Iterator[threading.Event]:
         stop = threading.Event()
-        config = FeaturesServiceConfig(bundle=str(bundle), unannounced=True, max_age_s=60.0)
+        settings = {"unannounced": True, "max_age_s": 60.0, **more}
+        config = FeaturesServiceConfig(bundle=str(bundle), **settings)
         node = threading.Thread(
             target=run_estimating, args=(config, link, "lab", stop), kwargs={"instance": instance}
         )
@@ -185,6 +186,28 @@ def test_a_standby_with_another_bundle_says_so(
         after = finger.touch_until_estimated()
         assert after.bundle_sha256 != before.bundle_sha256, "which bundle answered is not visible"
         until(lambda: finger.status("features-b").state is ServiceState.READY)
+
+
+def test_a_standby_takes_over_from_one_that_refuses_everything(
+    replica: Replica, make_bundle: Callable[..., Path], finger: Finger, until: Until
+) -> None:
+    """As where the clock of the active service's host was set."""
+    bundle = make_bundle()
+
+    def old() -> float:
+        finger.send(age_s=20.0)
+        return finger.status("features-b").counters.get("estimates_published", 0)
+
+    with replica("features-a", bundle, max_age_s=10.0):
+        assert finger.touch_until_estimated()
+        with replica("features-b", bundle):
+            until(lambda: finger.touch() is not None and stood_by(finger, "features-b") > 0)
+            assert finger.status("features-b").counters.get("estimates_published", 0) == 0
+            until(lambda: old() >= 5)
+            assert finger.status("features-a").counters["stale"] > 0
+            twice = finger.estimates.counters.get("reordered", 0)
+            until(lambda: finger.touch() is not None and stood_by(finger, "features-a") > 0)
+            assert finger.estimates.counters.get("reordered", 0) == twice
 
 
 def test_a_standby_may_start_first(

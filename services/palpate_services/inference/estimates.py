@@ -454,9 +454,9 @@ class TaredSamples:
         error = RemoteError(
             f"sensor {sensor!r} is a {kind.name} with {kind.layout.electrodes} electrodes, the "
             f"bundle {runtime.label} is made for a {runtime.sensor_type.name}",
-            remedy=f"name the other sensors in the option sensors, or serve a bundle for a "
-            f"{kind.name}: palpate model load NAME --sensor {sensor}",
+            remedy="no bundle is made for this type yet: name the sensors to serve in the table of "
+            "this service, sensors = [...]",
             code=ErrorCode.INVALID_REQUEST,
         )
-        # Not degraded: the sensors of the right type are served as before.
+        # It degrades when nothing else has come of it for a second: InputReport.
         self._health.fail(error, degraded=False)

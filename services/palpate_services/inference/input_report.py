@@ -139,8 +139,12 @@ class InputReport:
             frame = about(sensor, stamp, tare_id=tare_id, model=model)
             found.frames[reason] = {**frame, "reason": reason}
 
-    def report(self) -> None:
-        """Tell health; call it a few times a second."""
+    def report(self) -> dict[str, str]:
+        """Tell health; call it a few times a second.
+
+        Returns:
+            The sensors that get nothing but refusals, with the reason of most of them.
+        """
         now_s = time.monotonic()
         for sensor, found in list(self._refused.items()):
             if now_s > found.last_s + _SILENT_S:
@@ -166,6 +170,7 @@ class InputReport:
         elif self._in_trouble:
             self._in_trouble = False
             self._recovered()
+        return {sensor: found.reason for sensor, found in wrong.items()}
 
     def _error(self, wrong: Mapping[str, _Refusals]) -> RemoteError:
         sensors = sorted(wrong)

@@ -83,7 +83,8 @@ _ERRORS: dict[EstimateRefusal, tuple[ErrorCode, str, str]] = {
     EstimateRefusal.WRONG_SENSOR: (
         ErrorCode.INVALID_REQUEST,
         "the served bundle was made for another type of sensor",
-        "serve a bundle for this sensor type",
+        "no bundle is made for this type yet: name the sensors to serve in the table of this "
+        "service, sensors = [...]",
     ),
     EstimateRefusal.WRONG_MESH: (
         ErrorCode.WRONG_CONTRACT,
@@ -121,6 +122,17 @@ _ERRORS: dict[EstimateRefusal, tuple[ErrorCode, str, str]] = {
         "check the sensor's name and that its gateway runs, or tare and send a later frame",
     ),
 }
+
+
+_REFUSED_BY_ALL = frozenset(
+    {
+        EstimateRefusal.UNTARED,
+        EstimateRefusal.WRONG_TARE,
+        EstimateRefusal.INVALID_CHANNELS,
+        EstimateRefusal.REPLAYED,
+    }
+)
+"""Reasons that lie in the message: no standby would answer it either."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -388,7 +400,9 @@ class EstimatePublisher(Generic[M, E]):
             if self._exchanged:
                 self._exchanged = False
                 show(self._models, self._health)
-            self._input.report()
+            for sensor, reason in self._input.report().items():
+                if self._duty is not None and reason not in _REFUSED_BY_ALL:
+                    self._duty.release(sensor)  # a standby may be able to
         period_ns = now_ns - self._gauged_ns
         if last or period_ns >= _GAUGE_PERIOD_NS:
             self._gauged_ns = now_ns

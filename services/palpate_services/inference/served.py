@@ -148,6 +148,10 @@ class ServedModels:
         else:
             for sensor, one in remembered.items():
                 assigned[sensor] = self._restored(sensor, one, wanted.get(sensor))
+            # A command that came while the file could not be read was remembered alone.
+            for sensor, bundle in wanted.items():
+                if sensor not in assigned:
+                    assigned[sensor] = Assignment(self._first(bundle), time.time_ns())
         self._serving = Serving(assigned)
         try:
             self._remember()
