@@ -16,6 +16,7 @@ from rich.text import Text
 from palpate.bus import Session
 from palpate.bus.topics import duty_root
 from palpate.config import LinkConfig
+from palpate.errors import printable
 from palpate_deploy.station.activity import (
     ProcessActivity,
     SensorActivity,
@@ -141,8 +142,8 @@ def _print(console: Console, found: Sequence[StationSummary]) -> None:
         for trouble in one.troubles:
             name = process_name(trouble.service, trouble.instance)
             line = f"{one.station}: {name}: {trouble.problem}"
-            console.print(Text(line, style="red"), soft_wrap=True)
-            console.print(Text(f"  fix: {trouble.remedy}"), soft_wrap=True)
+            console.print(Text(printable(line), style="red"), soft_wrap=True)
+            console.print(Text(printable(f"  fix: {trouble.remedy}")), soft_wrap=True)
 
 
 def _sensor(sensor: SensorActivity) -> str:

@@ -64,7 +64,7 @@ def list_models(folder: Path, *, as_json: bool) -> None:
     if as_json:
         print(json.dumps({"repository": str(folder), "bundles": rows}, indent=2))
         return
-    table = Table(title=f"with palpate, and in {folder}", title_justify="left")
+    table = Table(title=cell(f"with palpate, and in {folder}"), title_justify="left")
     for column in ("bundle", "task", "sha256", "trained on", "metrics"):
         table.add_column(column, overflow="fold")
     for row in rows:
@@ -255,13 +255,13 @@ def _show(found: dict[str, tuple[ModelInventory, ...]], *, as_json: bool) -> Non
         for one in inventories:
             name = service if one.instance == service else f"{service}/{one.instance}"
             for served in one.served:
-                bundle = f"{served.name}:{served.version}" if served.name else "[red]none[/]"
+                bundle = cell(f"{served.name}:{served.version}") if served.name else "[red]none[/]"
                 table.add_row(
                     name,
                     served.sensor or "all others",
                     bundle,
                     served.bundle_sha256.hex()[:12],
-                    served.previous or "-",
+                    cell(served.previous or "-"),
                 )
     Console().print(table)
     for inventories in found.values():
