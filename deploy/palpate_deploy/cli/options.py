@@ -137,13 +137,15 @@ def station_link(
 
 def existing_file(path: Path, *, or_folder: bool = False) -> Path:
     """The path of an existing file, ``or_folder``; otherwise a ``ConfigError``."""
+    from palpate.config import looking_at
     from palpate.errors import ConfigError
 
-    if not (path.is_file() or (or_folder and path.is_dir())):
-        if path.exists():
-            kind = "a folder" if path.is_dir() else "no regular file"
-            raise ConfigError(f"{path} is {kind}", remedy="give a file")
-        raise ConfigError(f"{path} does not exist", remedy="check the path")
+    with looking_at(path):
+        if not (path.is_file() or (or_folder and path.is_dir())):
+            if path.exists():
+                kind = "a folder" if path.is_dir() else "no regular file"
+                raise ConfigError(f"{path} is {kind}", remedy="give a file")
+            raise ConfigError(f"{path} does not exist", remedy="check the path")
     return path
 
 
