@@ -249,7 +249,8 @@ def calibrate(
     serve: Annotated[
         bool | None,
         typer.Option(
-            help="Whether the station serves it for this finger; default: if it was recorded there."
+            help="Whether the station serves it for this finger.",
+            show_default="serve, except with --from",
         ),
     ] = None,
     token: TokenOption = None,
