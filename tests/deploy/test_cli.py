@@ -471,6 +471,27 @@ def test_a_negative_wait_is_refused(command: list[str]) -> None:
     assert "--timeout-s" in result.output
 
 
+@pytest.mark.parametrize("number", ["inf", "nan"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["top", "--period-s"],
+        ["tare", "finger", "--timeout-s"],
+        ["new-station", "--look-s"],
+        ["demo", "--seconds"],
+        ["topic", "list", "--seconds"],
+        ["topic", "hz", "--seconds"],
+        ["topic", "echo", "--timeout-s"],
+        ["record", "--duration-s"],
+        ["bench", "soak", "--minutes"],
+    ],
+)
+def test_a_time_without_end_is_refused(command: list[str], number: str) -> None:
+    result = CliRunner().invoke(app, [*command, number])
+    assert result.exit_code == 2
+    assert f"Invalid value for '{command[-1]}'" in result.output
+
+
 @pytest.mark.parametrize("columns", ["", "90"])
 def test_tables_in_a_file_are_not_cut(
     palpate: Palpate, monkeypatch: pytest.MonkeyPatch, columns: str

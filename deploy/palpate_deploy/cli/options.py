@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -105,6 +106,13 @@ def group(help_text: str) -> typer.Typer:
 def example(*lines: str) -> str:
     """The end of a command's help: runnable lines."""
     return "Example: " + "  or  ".join(lines)
+
+
+def finite(value: float | None) -> float | None:
+    """The number of an option; infinity and NaN, which a least value does not stop, are refused."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not finite.")
+    return value
 
 
 def client_link(connect: str, tls: TlsConfig | Path | None = None) -> LinkConfig:
