@@ -21,7 +21,7 @@ import typer
 from typer.testing import CliRunner
 
 from palpate.bus import Session
-from palpate.config import LinkConfig
+from palpate.config import TLS_FILES, LinkConfig, TlsConfig
 from palpate.errors import (
     BundleError,
     ConfigError,
@@ -35,7 +35,7 @@ from palpate.errors import (
 from palpate_deploy.cli import WIDE
 from palpate_deploy.cli import data as training
 from palpate_deploy.cli.app import app
-from palpate_deploy.cli.options import DEFAULT_CONNECT, DEFAULT_STATION
+from palpate_deploy.cli.options import DEFAULT_CONNECT, DEFAULT_STATION, station_link
 from palpate_deploy.diagnose import doctor
 from palpate_deploy.station import status, tare
 from palpate_deploy.station.host import check_free, free_endpoint
@@ -327,6 +327,21 @@ def test_what_is_given_beside_a_profile_holds(
         assert done.exit_code == 0, done.output
     assert asked[0] == where
     assert asked[1] == (DEFAULT_CONNECT, DEFAULT_STATION)
+
+
+@pytest.mark.parametrize("router", ["tls/192.168.1.2:7447", "tcp/192.168.1.2:7447"])
+def test_certificates_are_used_beside_a_profile_that_has_none(tmp_path: Path, router: str) -> None:
+    for name in TLS_FILES.values():
+        (tmp_path / name).touch()
+    path = tmp_path / "mine.toml"
+    path.write_text(f'[link]\nconnect = ["{router}"]\n', "utf-8")
+    if router.startswith("tcp/"):
+        with pytest.raises(ConfigError, match="is not encrypted, although certificates are given"):
+            station_link(str(path), None, None, tmp_path)
+        return
+    link, _ = station_link(str(path), None, None, tmp_path)
+    assert link.connect == (router,)
+    assert link.tls == TlsConfig.of_folder(tmp_path)
 
 
 @pytest.mark.parametrize(
