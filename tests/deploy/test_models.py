@@ -28,7 +28,7 @@ from palpate.errors import (
     StreamTimeout,
 )
 from palpate.files.bundle import read_bundle, write_bundle
-from palpate.messages import ModelAction, ModelInventory
+from palpate.messages import ModelAction, ModelInventory, ServedModel
 from palpate_deploy.diagnose import doctor
 from palpate_deploy.station import models
 from palpate_deploy.station.profile import load_profile, parse_profile
@@ -249,7 +249,7 @@ def give(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., None]
     token = tmp_path / "token"
     token.write_text("ab" * 32)
     token.chmod(0o600)
-    monkeypatch.setattr(models.Session, "open", MagicMock())
+    monkeypatch.setattr(Session, "open", MagicMock())
 
     def give(services: Services, action: ModelAction, service: str | None = None) -> None:
         monkeypatch.setattr(models, "ModelAdmin", lambda *_: services)
@@ -299,3 +299,11 @@ def test_no_service_is_named_that_the_station_may_not_have(give: Callable[..., N
             give(Services(), action)
     with pytest.raises(LinkError, match="no service 'field' answers"):
         give(Services(), ModelAction.LIST, "field")
+
+
+def test_the_name_of_a_bundle_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    served = ServedModel("", "x[/]", 1, bytes(32), 0, "y[red]:2")
+    models._show({"features": (ModelInventory("features", (served,), ()),)}, as_json=False)
+    shown = capsys.readouterr().out
+    assert "x[/]:1" in shown
+    assert "y[red]:2" in shown
