@@ -6,7 +6,8 @@ import difflib
 import ipaddress
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from types import UnionType
@@ -58,6 +59,22 @@ def check_duration(seconds: float, what: str, *, most: float) -> float:
             remedy=f"give {what} in seconds, more than 0",
         )
     return seconds
+
+
+@contextmanager
+def looking_at(path: Path) -> Iterator[None]:
+    """For a block that looks at a path: what exists may lie in a folder of another user.
+
+    Raises:
+        ConfigError: The block may not look at it.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(
+            f"{path} cannot be read: {error.strerror or error}",
+            remedy="read it as its owner, or name another place",
+        ) from error
 
 
 Name = Annotated[str, AfterValidator(check_name)]
@@ -122,11 +139,13 @@ class TlsConfig(StrictConfig):
         """The certificates of a folder with ``ca.pem``, ``cert.pem`` and ``key.pem``.
 
         Raises:
-            ConfigError: One of them is missing.
+            ConfigError: One of them is missing, or the folder is closed.
         """
         paths = {key: Path(folder) / name for key, name in TLS_FILES.items()}
         for path in paths.values():
-            if not path.is_file():
+            with looking_at(path):
+                found = path.is_file()
+            if not found:
                 raise ConfigError(
                     f"{path} does not exist",
                     remedy=f"name a folder that holds {', '.join(TLS_FILES.values())}: "
@@ -141,10 +160,12 @@ class TlsConfig(StrictConfig):
         Or ``FOLDER/router_cert.pem``, as a unit of systemd hands them over (``palpate install``).
 
         Raises:
-            ConfigError: One of them is missing.
+            ConfigError: One of them is missing, or the folder is closed.
         """
         flat = {key: folder / f"{role.value}_{name}" for key, name in TLS_FILES.items()}
-        if all(path.is_file() for path in flat.values()):
+        with looking_at(folder):
+            handed_over = all(path.is_file() for path in flat.values())
+        if handed_over:
             return cls.model_validate(flat)
         return cls.of_folder(folder / role.value)
 

@@ -21,7 +21,7 @@ import typer
 from typer.testing import CliRunner
 
 from palpate.bus import Session
-from palpate.config import LinkConfig
+from palpate.config import TLS_FILES, LinkConfig, TlsConfig
 from palpate.errors import (
     BundleError,
     ConfigError,
@@ -35,7 +35,7 @@ from palpate.errors import (
 from palpate_deploy.cli import WIDE
 from palpate_deploy.cli import data as training
 from palpate_deploy.cli.app import app
-from palpate_deploy.cli.options import DEFAULT_CONNECT, DEFAULT_STATION
+from palpate_deploy.cli.options import DEFAULT_CONNECT, DEFAULT_STATION, station_link
 from palpate_deploy.diagnose import doctor
 from palpate_deploy.station import status, tare
 from palpate_deploy.station.host import check_free, free_endpoint
@@ -329,6 +329,21 @@ def test_what_is_given_beside_a_profile_holds(
     assert asked[1] == (DEFAULT_CONNECT, DEFAULT_STATION)
 
 
+@pytest.mark.parametrize("router", ["tls/192.168.1.2:7447", "tcp/192.168.1.2:7447"])
+def test_certificates_are_used_beside_a_profile_that_has_none(tmp_path: Path, router: str) -> None:
+    for name in TLS_FILES.values():
+        (tmp_path / name).touch()
+    path = tmp_path / "mine.toml"
+    path.write_text(f'[link]\nconnect = ["{router}"]\n', "utf-8")
+    if router.startswith("tcp/"):
+        with pytest.raises(ConfigError, match="is not encrypted, although certificates are given"):
+            station_link(str(path), None, None, tmp_path)
+        return
+    link, _ = station_link(str(path), None, None, tmp_path)
+    assert link.connect == (router,)
+    assert link.tls == TlsConfig.of_folder(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("driver", "grade"),
     [("ros_bag", "ok"), ("text_log", "fail"), ("record", "fail"), ("pose_file", "fail")],
@@ -469,6 +484,27 @@ def test_a_negative_wait_is_refused(command: list[str]) -> None:
     result = CliRunner().invoke(app, [*command, "--timeout-s", "-1"])
     assert result.exit_code == 2
     assert "--timeout-s" in result.output
+
+
+@pytest.mark.parametrize("number", ["inf", "nan"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["top", "--period-s"],
+        ["tare", "finger", "--timeout-s"],
+        ["new-station", "--look-s"],
+        ["demo", "--seconds"],
+        ["topic", "list", "--seconds"],
+        ["topic", "hz", "--seconds"],
+        ["topic", "echo", "--timeout-s"],
+        ["record", "--duration-s"],
+        ["bench", "soak", "--minutes"],
+    ],
+)
+def test_a_time_without_end_is_refused(command: list[str], number: str) -> None:
+    result = CliRunner().invoke(app, [*command, number])
+    assert result.exit_code == 2
+    assert f"Invalid value for '{command[-1]}'" in result.output
 
 
 @pytest.mark.parametrize("columns", ["", "90"])

@@ -10,10 +10,12 @@ from typing import Any
 import pytest
 
 from palpate.bus import Session
+from palpate.bus.topics import LIVE_ROOT
 from palpate.config import LinkConfig
 from palpate.errors import ConfigError, LinkError
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState
+from palpate_deploy.station import fleet
 from palpate_deploy.station.fleet import look_at_fleet, show_fleet
 from palpate_deploy.station.profile import load_profile
 
@@ -41,6 +43,28 @@ def test_each_station_has_a_line(link: LinkConfig, capsys: pytest.CaptureFixture
         assert "the cable is out" in by_name["arm2"][0]["problem"]
         for reporter in reporters:
             reporter.close()
+
+
+def test_a_name_that_no_station_can_have_hides_no_other(
+    link: LinkConfig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It ended the command; and what was cut off was not told."""
+    monkeypatch.setattr(fleet, "_STATIONS_MOST", 1)
+    with (
+        Session.open(link, station="arm1") as first,
+        Session.open(link, station="arm2") as second,
+    ):
+        for session in (first, second):
+            session.presence("features", instance="features").ready()
+        declare = first._raw.liveliness().declare_token
+        odd = [
+            declare(f"{LIVE_ROOT}/{name}/features/features/alive")
+            for name in ("Arm 1", "a[red]", "\x1b[2J")
+        ]
+        assert [one.station for one in look_at_fleet(link)] == ["arm1"]
+        for token in odd:
+            token.undeclare()
+    assert "2 stations are seen; the first 1 by name are asked" in caplog.text
 
 
 def test_nobody_is_a_failure(link: LinkConfig) -> None:

@@ -144,6 +144,21 @@ def test_the_supervisor_speaks_for_the_router_and_counts_restarts() -> None:
     assert value(found["palpate_hung_total"], service="features", sensor="") == 2
 
 
+def test_each_replica_has_its_own_figures() -> None:
+    """Those of the second were left out: the first was not told apart from it."""
+    other = dataclasses.replace(
+        SUPERVISOR,
+        instance="supervisor-b",
+        counters={"features.hung": 4},
+        gauges={},
+        processes=(SupervisedProcess("features", "features-b", "running", 4712, 1, 1.0),),
+    )
+    found = exported(SUPERVISOR, other)
+    hung = {one.labels["instance"]: one.value for one in found["palpate_hung_total"]}
+    assert hung == {"left": 2, "features-b": 4}
+    assert value(found["palpate_exporter_left_out"]) == 0
+
+
 def test_a_process_that_says_nothing_is_down_and_has_no_old_values() -> None:
     found = exported(FEATURES, up=False)
     assert value(found["palpate_process_up"]) == 0

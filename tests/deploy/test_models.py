@@ -19,8 +19,16 @@ import pytest
 
 from palpate.bus import Session
 from palpate.config import LinkConfig
-from palpate.errors import LinkError
+from palpate.errors import (
+    ConfigError,
+    ErrorCode,
+    LinkError,
+    PalpateError,
+    RemoteError,
+    StreamTimeout,
+)
 from palpate.files.bundle import read_bundle, write_bundle
+from palpate.messages import ModelAction, ModelInventory, ServedModel
 from palpate_deploy.diagnose import doctor
 from palpate_deploy.station import models
 from palpate_deploy.station.profile import load_profile, parse_profile
@@ -211,11 +219,91 @@ def test_a_printed_profile_names_no_folder_of_who_printed_it(palpate: Palpate) -
     assert os.environ["XDG_STATE_HOME"] not in printed.stdout
 
 
-def test_no_service_is_named_that_the_station_may_not_have() -> None:
-    class Silent:
-        def served(self, service: str) -> Any:
-            raise LinkError(f"no service {service!r} answers", remedy="start it")
+class Services:
+    """Stands for the services with models: what each of them answers to the question what serves.
 
-    admin: Any = Silent()
-    with pytest.raises(LinkError, match="none of the services features, field answers"):
-        models._served(admin, ("features", "field"))
+    A service that is not named does not run. ``ordered`` says which got an order.
+    """
+
+    def __init__(self, **answers: PalpateError | tuple[ModelInventory, ...]) -> None:
+        self._answers = answers
+        self.ordered: list[str] = []
+
+    def served(self, service: str) -> tuple[ModelInventory, ...]:
+        gone = LinkError(f"no service {service!r} answers", remedy="start it")
+        answer = self._answers.get(service, gone)
+        if isinstance(answer, PalpateError):
+            raise answer
+        return answer
+
+    def unload(self, service: str, *, sensor: str = "") -> tuple[ModelInventory, ...]:
+        self.ordered.append(service)
+        return ()
+
+    roll_back = unload
+
+
+@pytest.fixture
+def give(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., None]:
+    """Give a command to services that are made up."""
+    token = tmp_path / "token"
+    token.write_text("ab" * 32)
+    token.chmod(0o600)
+    monkeypatch.setattr(Session, "open", MagicMock())
+
+    def give(services: Services, action: ModelAction, service: str | None = None) -> None:
+        monkeypatch.setattr(models, "ModelAdmin", lambda *_: services)
+        models.change_model(
+            LinkConfig(), "lab", action, token=token, profile=None, service=service, as_json=True
+        )
+
+    return give
+
+
+@pytest.mark.parametrize("action", [ModelAction.UNLOAD, ModelAction.ROLL_BACK])
+def test_where_several_services_have_models_one_is_named(
+    give: Callable[..., None], action: ModelAction
+) -> None:
+    """It was features that lost its bundle, whatever had been loaded last."""
+    hangs = StreamTimeout("field did not answer", remedy="look")
+    for field in ((), hangs):
+        both = Services(features=(), field=field)
+        with pytest.raises(ConfigError, match=r"--service features \| field"):
+            give(both, action)
+        assert both.ordered == []
+        give(both, action, "field")
+        assert both.ordered == ["field"]
+    alone = Services(synthesis=())
+    give(alone, action)
+    assert alone.ordered == ["synthesis"]
+    refused = RemoteError("no", remedy="x", code=ErrorCode.PERMISSION_DENIED)
+    with pytest.raises(RemoteError):
+        give(Services(features=refused, field=refused), action)
+
+
+def test_a_service_that_hangs_hides_no_other(
+    give: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    hangs = StreamTimeout("features did not answer", remedy="look")
+    with pytest.raises(StreamTimeout):
+        give(Services(features=hangs, field=()), ModelAction.LIST)
+    assert json.loads(capsys.readouterr().out) == {"field": []}
+    with pytest.raises(StreamTimeout):
+        give(Services(features=hangs), ModelAction.LIST)
+    assert capsys.readouterr().out == ""
+
+
+def test_no_service_is_named_that_the_station_may_not_have(give: Callable[..., None]) -> None:
+    for action in (ModelAction.LIST, ModelAction.UNLOAD):
+        with pytest.raises(LinkError, match="none of the services features, field, synthesis ans"):
+            give(Services(), action)
+    with pytest.raises(LinkError, match="no service 'field' answers"):
+        give(Services(), ModelAction.LIST, "field")
+
+
+def test_the_name_of_a_bundle_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    served = ServedModel("", "x[/]", 1, bytes(32), 0, "y[red]:2")
+    models._show({"features": (ModelInventory("features", (served,), ()),)}, as_json=False)
+    shown = capsys.readouterr().out
+    assert "x[/]:1" in shown
+    assert "y[red]:2" in shown

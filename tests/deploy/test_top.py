@@ -21,28 +21,31 @@ from palpate.bus import Session
 from palpate.census import ProcessReport
 from palpate.codec import STATUS
 from palpate.config import LinkConfig
-from palpate.errors import LinkError
+from palpate.errors import ErrorCode, LinkError, printable
 from palpate.health import Health, HealthReporter
 from palpate.messages import (
     GAUGE_MAX,
     UPTIME_MAX_S,
+    ErrorReply,
     SensorState,
     SensorStatus,
     ServiceState,
     Status,
     SupervisedProcess,
 )
-from palpate_deploy.station import observation
+from palpate_deploy.station import fleet, observation
 from palpate_deploy.station.activity import (
     DropCount,
     process_activities,
     sensor_activities,
     sensor_part,
 )
+from palpate_deploy.station.fleet import StationSummary
 from palpate_deploy.station.observation import ObservedProcess, StationObserver
 from palpate_deploy.station.status import _print, show_status, shown_counters
 from palpate_deploy.station.tare import take_tare
 from palpate_deploy.station.top import _as_json, run_top, screen
+from palpate_deploy.station.troubles import troubles
 from palpate_deploy.station.web.snapshot import snapshot
 from palpate_services.inference.estimates import EstimateRefusal
 
@@ -215,6 +218,37 @@ def test_the_picture_shows_all_of_it(width: int) -> None:
     ):
         assert words in everything
     assert ("features-twin:1" in everything) == (width > 100)
+
+
+@pytest.mark.parametrize("acts", ["\x1b]0;owned\x07\x1b[2J", "[/]", "[red]"])
+def test_no_text_of_a_process_acts_on_the_terminal(acts: str) -> None:
+    name = acts if acts.isprintable() else "x"  # names hold printable characters only
+    hostile = dataclasses.replace(
+        FEATURES,
+        service=f"f{name}",
+        state=ServiceState.DEGRADED,
+        counters={f"lost{acts}": 1, f"thumb{acts}.missing": 1},
+        gauges={f"s{acts}_p50_s": 1.0, f"thumb{acts}.clock_quality": 2.0},
+        sensors=(f"thumb{acts}",),
+        message=f"says {acts}",
+        last_error=ErrorReply(ErrorCode.INTERNAL, f"bundle {acts}", f"remedy {acts}", 0.0),
+        models=(f"m{name}:1",),
+    )
+    hostile = STATUS.decode(STATUS.encode(hostile))
+    report = ProcessReport(hostile.service, f"i{acts}", True, True, hostile)
+    seen = [ObservedProcess(report)]
+    text = io.StringIO()
+    console = Console(file=text, width=400)
+    _print(console, "lab", "", [report], troubles([report]))
+    console.print(screen("lab", seen, 400))
+    summary = StationSummary("lab", process_activities(seen), (), (), troubles([report]))
+    fleet._print(console, [summary])
+    shown = text.getvalue()
+    assert all(char == "\n" or char.isprintable() for char in shown)
+    told = printable(acts)
+    assert shown.count(f"bundle {told}") == shown.count(f"fix: remedy {told}") == 3
+    for words in (f"lost{told} 1", f"thumb{told}", f"s{told}", f"clock of thumb{told}: "):
+        assert words in shown
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +29,24 @@ def test_newest_version_of_a_name(models: Path) -> None:
     assert resolve("features-x", models) == models / "features-x" / "10"
     assert resolve("features-x:2", models) == models / "features-x" / "2"
     assert available(models) == ["features-x:1", "features-x:2", "features-x:10"]
+
+
+def test_a_bundle_in_a_closed_folder_hides_no_other(
+    models: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is found: whoever reads it is told why that cannot be."""
+    closed = models / "features-x" / "2"
+
+    def look(path: Path) -> bool:
+        if closed in path.parents:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return os.path.isfile(path)
+
+    monkeypatch.setattr(Path, "is_file", look)  # root may look everywhere
+    assert resolve("features-x", models) == models / "features-x" / "10"
+    assert available(models) == ["features-x:1", "features-x:2", "features-x:10"]
+    with pytest.raises(ConfigError, match=f"{closed} cannot be read: Permission denied"):
+        resolve(str(closed))
 
 
 def test_path_of_a_folder(models: Path) -> None:

@@ -320,7 +320,7 @@ def test_nobody_else_serves_for_a_bundle_that_cannot_be_had_again(
     assert (of(again), of(again, "thumb")) == ("x:1", "none")
     assert again.problem is not None
     assert "y:1 does not serve sensor 'thumb' again: " in again.problem.problem
-    assert "palpate model unload --sensor thumb" in again.problem.remedy
+    assert "palpate model unload --service features --sensor thumb" in again.problem.remedy
     entry = do(again, ModelAction.LIST).served[1]
     assert (entry.sensor, entry.name) == ("thumb", "")
     # Where it comes back, it serves after the next start; else another is chosen for the sensor.

@@ -33,6 +33,7 @@ from palpate_deploy.cli.options import (
     client_link,
     example,
     existing_file,
+    finite,
     group,
     station_link,
 )
@@ -140,7 +141,9 @@ def status(
 
 @app.command(epilog=example("palpate top", "palpate top --once", "palpate top --json"))
 def top(
-    period_s: Annotated[float, typer.Option(min=0.1, help="Time between two pictures [s].")] = 1.0,
+    period_s: Annotated[
+        float, typer.Option(callback=finite, min=0.1, help="Time between two pictures [s].")
+    ] = 1.0,
     once: Annotated[bool, typer.Option("--once", help="Print one picture and end.")] = False,
     profile: WantedOption = None,
     connect: ConnectElseOption = None,
@@ -194,7 +197,9 @@ def tare(
     ] = False,
     timeout_s: Annotated[
         float | None,
-        typer.Option(min=0, help="Longest time to wait [s]; default: enough for the frames."),
+        typer.Option(
+            callback=finite, min=0, help="Longest time to wait [s]; default: enough for the frames."
+        ),
     ] = None,
     connect: ConnectOption = DEFAULT_CONNECT,
     tls: TlsOption = None,
@@ -249,7 +254,8 @@ def calibrate(
     serve: Annotated[
         bool | None,
         typer.Option(
-            help="Whether the station serves it for this finger; default: if it was recorded there."
+            help="Whether the station serves it for this finger.",
+            show_default="serve, except with --from",
         ),
     ] = None,
     token: TokenOption = None,
@@ -339,7 +345,9 @@ def new_station(
         ),
     ] = False,
     presses: Annotated[int, typer.Option(min=6, help="Presses to calibrate with.")] = 20,
-    look_s: Annotated[float, typer.Option(min=0, help="How long the signals are shown [s].")] = 5.0,
+    look_s: Annotated[
+        float, typer.Option(callback=finite, min=0, help="How long the signals are shown [s].")
+    ] = 5.0,
 ) -> None:
     """Find what is connected, try it, and write a profile; with --start as far as estimates.
 
@@ -377,7 +385,7 @@ def new_station(
 @app.command(epilog=example("palpate demo --seconds 20 --out runs/demo"))
 def demo(
     seconds: Annotated[
-        float, typer.Option(min=1, help="Duration after the first estimates [s].")
+        float, typer.Option(callback=finite, min=1, help="Duration after the first estimates [s].")
     ] = 20,
     out: Annotated[Path, typer.Option(help="Folder for record, view and picture.")] = Path(
         "runs/demo"
@@ -396,7 +404,9 @@ TopicArgument = Annotated[str, typer.Argument(metavar="TOPIC", help="E.g. electr
 
 @topic_app.command("list", epilog=example("palpate topic list"))
 def list_(
-    seconds: Annotated[float, typer.Option(min=0.1, help="How long to listen [s].")] = 1.5,
+    seconds: Annotated[
+        float, typer.Option(callback=finite, min=0.1, help="How long to listen [s].")
+    ] = 1.5,
     connect: ConnectOption = DEFAULT_CONNECT,
     tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
@@ -414,7 +424,9 @@ def list_(
 def hz(
     topic: TopicArgument = "electrodes",
     sensor: SensorOption = "*",
-    seconds: Annotated[float, typer.Option(min=0, help="Duration [s]; 0 = until Ctrl-C.")] = 0,
+    seconds: Annotated[
+        float, typer.Option(callback=finite, min=0, help="Duration [s]; 0 = until Ctrl-C.")
+    ] = 0,
     connect: ConnectOption = DEFAULT_CONNECT,
     tls: TlsOption = None,
     station: StationOption = DEFAULT_STATION,
@@ -434,7 +446,8 @@ def echo(
     sensor: SensorOption = "*",
     count: Annotated[int, typer.Option(min=0, help="Number of messages; 0 = until Ctrl-C.")] = 0,
     timeout_s: Annotated[
-        float, typer.Option(min=0, help="Stop if no message comes for this long [s].")
+        float,
+        typer.Option(callback=finite, min=0, help="Stop if no message comes for this long [s]."),
     ] = 10.0,
     connect: ConnectOption = DEFAULT_CONNECT,
     tls: TlsOption = None,

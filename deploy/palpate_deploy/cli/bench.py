@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from palpate_deploy.cli.options import JsonOption, example, group
+from palpate_deploy.cli.options import JsonOption, example, finite, group
 
 bench_app = group("Latency and load, compared with a bare implementation (the floor).")
 
@@ -54,13 +54,15 @@ OutOption = Annotated[
     epilog=example("palpate bench e2e --runs 5", "palpate bench e2e --seconds 2 --rounds 3 --json")
 )
 def e2e(
-    seconds: Annotated[float, typer.Option(min=0.5, help="Duration of one round [s].")] = 4.0,
+    seconds: Annotated[
+        float, typer.Option(callback=finite, min=0.5, help="Duration of one round [s].")
+    ] = 4.0,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of palpate and of the floor.")] = 6,
     runs: Annotated[int, typer.Option(min=1, help="Runs, with new processes each.")] = 1,
     sensors: Annotated[int, typer.Option(min=0, help="Fingers in the load test.")] = 40,
     fields: Annotated[int, typer.Option(min=0, help="Fingers in the load test of fields.")] = 5,
     load_seconds: Annotated[
-        float, typer.Option(min=1, help="Duration of the load test [s].")
+        float, typer.Option(callback=finite, min=1, help="Duration of the load test [s].")
     ] = 10.0,
     ramp: Annotated[bool, typer.Option(help="Raise the rate until a frame is lost.")] = True,
     bundle: Annotated[str, typer.Option(help="Bundle that is served.")] = "features-virtual",
@@ -88,9 +90,11 @@ def e2e(
 
 @bench_app.command(epilog=example("palpate bench hand --seconds 600"))
 def hand(
-    seconds: Annotated[float, typer.Option(min=2, help="Duration of the measurement [s].")] = 60.0,
+    seconds: Annotated[
+        float, typer.Option(callback=finite, min=2, help="Duration of the measurement [s].")
+    ] = 60.0,
     floor_seconds: Annotated[
-        float, typer.Option(min=2, help="Duration of the floor's measurement [s].")
+        float, typer.Option(callback=finite, min=2, help="Duration of the floor's measurement [s].")
     ] = 20.0,
     json_: JsonOption = False,
     save: SaveOption = False,
@@ -104,10 +108,11 @@ def hand(
 @bench_app.command(epilog=example("palpate bench alignment --page docs/results/alignment.md"))
 def alignment(
     seconds: Annotated[
-        float, typer.Option(min=0.5, help="Duration of the measurement [s].")
+        float, typer.Option(callback=finite, min=0.5, help="Duration of the measurement [s].")
     ] = 30.0,
     settle_seconds: Annotated[
-        float, typer.Option(min=0, help="Time for the clocks to settle before it [s].")
+        float,
+        typer.Option(callback=finite, min=0, help="Time for the clocks to settle before it [s]."),
     ] = 10.0,
     page: Annotated[
         Path | None,
@@ -128,8 +133,12 @@ def alignment(
 def swap(
     changes: Annotated[int, typer.Option(min=1, help="Loads; each is rolled back.")] = 20,
     sensors: Annotated[int, typer.Option(min=1, max=40, help="Fingers.")] = 1,
-    rate_hz: Annotated[float, typer.Option(min=1, max=1000, help="Frames of each [Hz].")] = 100.0,
-    hold_seconds: Annotated[float, typer.Option(min=0, help="Time between two changes [s].")] = 0.3,
+    rate_hz: Annotated[
+        float, typer.Option(callback=finite, min=1, max=1000, help="Frames of each [Hz].")
+    ] = 100.0,
+    hold_seconds: Annotated[
+        float, typer.Option(callback=finite, min=0, help="Time between two changes [s].")
+    ] = 0.3,
     out: OutOption = None,
     json_: JsonOption = False,
     save: SaveOption = False,
@@ -163,7 +172,9 @@ def codec(
 
 @bench_app.command(epilog=example("palpate bench faults", "palpate bench faults --only disk"))
 def faults(
-    seconds: Annotated[float, typer.Option(min=0.5, help="Duration of a quiet part [s].")] = 5.0,
+    seconds: Annotated[
+        float, typer.Option(callback=finite, min=0.5, help="Duration of a quiet part [s].")
+    ] = 5.0,
     only: Annotated[str, typer.Option(help="Only the rows whose name contains this.")] = "",
     out: OutOption = None,
     json_: JsonOption = False,
@@ -211,7 +222,7 @@ def restart(
     epilog=example("palpate bench soak --minutes 30 --out docs/results/serving/soak.json")
 )
 def soak(
-    minutes: Annotated[float, typer.Option(min=1, help="Duration [min].")] = 30.0,
+    minutes: Annotated[float, typer.Option(callback=finite, min=1, help="Duration [min].")] = 30.0,
     fingers: Annotated[int, typer.Option(min=1, help="Virtual fingers.")] = 3,
     fem: Annotated[bool, typer.Option(help="With the simulation service.")] = False,
     out: Annotated[
@@ -235,7 +246,9 @@ def fleet(
         list[int] | None,
         typer.Option(min=1, max=20, help="Stations at once; repeat. Default: 1, 2, 4, 8, 16."),
     ] = None,
-    seconds: Annotated[float, typer.Option(min=1, help="Duration of each part [s].")] = 8.0,
+    seconds: Annotated[
+        float, typer.Option(callback=finite, min=1, help="Duration of each part [s].")
+    ] = 8.0,
     times: Annotated[int, typer.Option(min=0, help="How often each fault; 0 = none.")] = 3,
     out: OutOption = None,
     json_: JsonOption = False,

@@ -20,6 +20,7 @@ from palpate_deploy.cli.options import (
     client_link,
     example,
     existing_file,
+    finite,
     group,
 )
 
@@ -28,7 +29,9 @@ RecordArgument = Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A pal
 
 def record(
     out: Annotated[Path, typer.Option(help="Folder of the record.")] = Path("runs"),
-    duration_s: Annotated[float, typer.Option(min=0, help="Duration [s]; 0 = until Ctrl-C.")] = 0,
+    duration_s: Annotated[
+        float, typer.Option(callback=finite, min=0, help="Duration [s]; 0 = until Ctrl-C.")
+    ] = 0,
     topic: Annotated[
         list[str] | None, typer.Option("--topic", help="Record only this topic; may be repeated.")
     ] = None,

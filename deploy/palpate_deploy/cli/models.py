@@ -36,7 +36,13 @@ TokenOption = Annotated[
     typer.Option("--token", metavar="FILE", help="The station's admin token; default: its own."),
 ]
 ServiceOption = Annotated[
+    str | None, typer.Option("--service", help="E.g. features; default: the only one that runs.")
+]
+ServiceOfBundleOption = Annotated[
     str | None, typer.Option("--service", help="E.g. features; default: by the bundle's task.")
+]
+AnyServiceOption = Annotated[
+    str | None, typer.Option("--service", help="E.g. features; default: each that runs.")
 ]
 OneSensorOption = Annotated[
     str, typer.Option("--sensor", help="Only for this sensor; default: all without one of its own.")
@@ -116,7 +122,7 @@ def sign(
 
 @model_app.command(epilog=example("palpate model served", "palpate model served --json"))
 def served(
-    service: ServiceOption = None,
+    service: AnyServiceOption = None,
     token: TokenOption = None,
     profile: StationProfileOption = None,
     connect: ConnectElseOption = None,
@@ -136,7 +142,7 @@ def served(
 def load(
     bundle: BundleArgument,
     sensor: OneSensorOption = "",
-    service: ServiceOption = None,
+    service: ServiceOfBundleOption = None,
     token: TokenOption = None,
     profile: StationProfileOption = None,
     connect: ConnectElseOption = None,
@@ -161,7 +167,7 @@ def load(
     )
 
 
-@model_app.command(epilog=example("palpate model unload --sensor finger1"))
+@model_app.command(epilog=example("palpate model unload --service features --sensor finger1"))
 def unload(
     sensor: OneSensorOption = "",
     service: ServiceOption = None,
@@ -179,7 +185,7 @@ def unload(
     _change(action, service, token, profile, connect, tls, station, sensor=sensor, as_json=json_)
 
 
-@model_app.command(epilog=example("palpate model rollback"))
+@model_app.command(epilog=example("palpate model rollback --service features"))
 def rollback(
     sensor: OneSensorOption = "",
     service: ServiceOption = None,

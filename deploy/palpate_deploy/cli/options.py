@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -107,6 +108,13 @@ def example(*lines: str) -> str:
     return "Example: " + "  or  ".join(lines)
 
 
+def finite(value: float | None) -> float | None:
+    """The number of an option; infinity and NaN, which a least value does not stop, are refused."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not finite.")
+    return value
+
+
 def client_link(connect: str, tls: TlsConfig | Path | None = None) -> LinkConfig:
     """Link of a command to a running station, with a short wait for its router."""
     from palpate.config import joining_link
@@ -126,6 +134,8 @@ def station_link(
 
     loaded = load_profile(profile)
     link = loaded.link
+    if tls is not None and not link.has_tls and connect is None and link.connect:
+        connect = link.connect[0]  # as if it were given: whether the two fit is checked
     if tls is not None and link.has_tls:  # another role than the operator's, or another folder
         link = link.model_copy(update={"tls": TlsConfig.of_folder(tls), "certificates": None})
     link = link.as_role(Role.OPERATOR)
@@ -137,13 +147,15 @@ def station_link(
 
 def existing_file(path: Path, *, or_folder: bool = False) -> Path:
     """The path of an existing file, ``or_folder``; otherwise a ``ConfigError``."""
+    from palpate.config import looking_at
     from palpate.errors import ConfigError
 
-    if not (path.is_file() or (or_folder and path.is_dir())):
-        if path.exists():
-            kind = "a folder" if path.is_dir() else "no regular file"
-            raise ConfigError(f"{path} is {kind}", remedy="give a file")
-        raise ConfigError(f"{path} does not exist", remedy="check the path")
+    with looking_at(path):
+        if not (path.is_file() or (or_folder and path.is_dir())):
+            if path.exists():
+                kind = "a folder" if path.is_dir() else "no regular file"
+                raise ConfigError(f"{path} is {kind}", remedy="give a file")
+            raise ConfigError(f"{path} does not exist", remedy="check the path")
     return path
 
 

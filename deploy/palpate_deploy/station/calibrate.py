@@ -260,7 +260,8 @@ def calibrate_finger(
         with Session.open(link, station=station) as session:
             ModelAdmin(session, secret).load("features", label, sensor=order.sensor)
         console.print(
-            f"{label} serves {order.sensor}; back: palpate model rollback --sensor {order.sensor}",
+            f"{label} serves {order.sensor}; back: palpate model rollback --service features "
+            f"--sensor {order.sensor}",
             markup=False,
         )
     else:

@@ -31,7 +31,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from palpate.bus.access import ROLE_OF
-from palpate.config import TLS_FILES, Role, TlsConfig, check_name
+from palpate.config import TLS_FILES, Role, TlsConfig, check_name, looking_at
 from palpate.errors import ConfigError
 
 AUTHORITY_KEY = "ca.key"
@@ -212,16 +212,17 @@ def list_certificates(folder: Path) -> list[IssuedCertificate | DamagedCertifica
     """The certificates in the folders of an authority's folder; or the one in the folder itself.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: There is none, or the folder is closed.
     """
     # A folder that has lost one of its two files is a damaged certificate, not none.
     files = (_CERTIFICATE, _KEY)
-    if any((folder / name).exists() for name in files):
-        folders = [folder]
-    else:
-        folders = sorted({path.parent for name in files for path in folder.glob(f"*/{name}")})
-    if not folders and not (folder / AUTHORITY).exists():
-        raise ConfigError(f"{folder} holds no certificates", remedy=_REMEDY)
+    with looking_at(folder):
+        if any((folder / name).exists() for name in files):
+            folders = [folder]
+        else:
+            folders = sorted({path.parent for name in files for path in folder.glob(f"*/{name}")})
+        if not folders and not (folder / AUTHORITY).exists():
+            raise ConfigError(f"{folder} holds no certificates", remedy=_REMEDY)
     return [_read_or_tell(one) for one in folders]
 
 
@@ -287,8 +288,9 @@ def _usage(*, authority: bool) -> x509.KeyUsage:
 
 
 def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    if not (folder / AUTHORITY).exists():
-        raise ConfigError(f"{folder} holds no authority", remedy=_REMEDY)
+    with looking_at(folder):
+        if not (folder / AUTHORITY).exists():
+            raise ConfigError(f"{folder} holds no authority", remedy=_REMEDY)
     try:
         key, authority = _read_key(folder / AUTHORITY_KEY), _read_pem(folder / AUTHORITY)
     except ConfigError as error:  # whose remedy is to issue it again, as for any other
@@ -401,7 +403,7 @@ def _write_folder(target: Path, files: dict[str, bytes]) -> None:
                     os.fsync(file.fileno())
             os.rename(aside, target)  # refused if something is in it
     except OSError as error:
-        there = target.exists()
+        there = os.path.exists(target)
         raise ConfigError(
             f"{target} holds something already" if there else f"{target} cannot be made: {error}",
             remedy="nothing is overwritten: choose another folder or --name, or remove it first",

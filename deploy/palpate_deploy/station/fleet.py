@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +17,7 @@ from rich.text import Text
 from palpate.bus import Session
 from palpate.bus.topics import duty_root
 from palpate.config import LinkConfig
+from palpate.errors import printable
 from palpate_deploy.station.activity import (
     ProcessActivity,
     SensorActivity,
@@ -26,6 +28,8 @@ from palpate_deploy.station.logs import FAILED, cell
 from palpate_deploy.station.observation import RATES_S, StationObserver
 from palpate_deploy.station.status import duration_text
 from palpate_deploy.station.troubles import Trouble, process_name, troubles
+
+_log = logging.getLogger(__name__)
 
 _ASK_S = 2.0
 _STATIONS_MOST = 256
@@ -68,12 +72,17 @@ def show_fleet(link: LinkConfig, *, as_json: bool) -> int:
 def look_at_fleet(link: LinkConfig) -> list[StationSummary]:
     """Every station with a living process, by name; takes three to six seconds.
 
+    Of more than 256 the first are asked, and a warning is logged.
+
     Raises:
         LinkError: There is no router.
     """
     through = link.model_copy(update={"direct": False})
     with Session.open(through) as session:
-        names = sorted({one.station for one in session.alive(station="*")})[:_STATIONS_MOST]
+        seen = sorted({one.station for one in session.alive(station="*")})
+    names = seen[:_STATIONS_MOST]
+    if len(seen) > len(names):
+        _log.warning("%d stations are seen; the first %d by name are asked", len(seen), len(names))
     with ExitStack() as stack, ThreadPoolExecutor(max(1, len(names))) as pool:
         sessions = {
             name: stack.enter_context(Session.open(through, station=name)) for name in names
@@ -141,8 +150,8 @@ def _print(console: Console, found: Sequence[StationSummary]) -> None:
         for trouble in one.troubles:
             name = process_name(trouble.service, trouble.instance)
             line = f"{one.station}: {name}: {trouble.problem}"
-            console.print(Text(line, style="red"), soft_wrap=True)
-            console.print(Text(f"  fix: {trouble.remedy}"), soft_wrap=True)
+            console.print(Text(printable(line), style="red"), soft_wrap=True)
+            console.print(Text(printable(f"  fix: {trouble.remedy}")), soft_wrap=True)
 
 
 def _sensor(sensor: SensorActivity) -> str:

@@ -148,11 +148,12 @@ class StationCollector:
 
     def _figures(self, series: _Series, process: tuple[str, str, str], status: Status) -> None:
         """Every counter and gauge."""
+        instances = {child.service: child.instance for child in status.processes}
 
         def labels(sensor: str) -> tuple[str, ...]:
             # A supervisor speaks for others: what stands in front is the name of a process.
             if sensor and status.service == SUPERVISOR[0]:
-                return (self._station, sensor, sensor, "")
+                return (self._station, sensor, instances.get(sensor, sensor), "")
             return (*process, sensor)
 
         for name, count in sorted(status.counters.items()):

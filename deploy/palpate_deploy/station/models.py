@@ -15,7 +15,7 @@ from palpate.admin import read_token, token_file
 from palpate.bus import Session, endpoints
 from palpate.client.models import ModelAdmin
 from palpate.config import LinkConfig
-from palpate.errors import LinkError, PalpateError, printable
+from palpate.errors import ConfigError, LinkError, PalpateError, printable
 from palpate.files.bundle import Bundle, read_manifest
 from palpate.files.card import model_card
 from palpate.files.signature import sign_bundle
@@ -64,7 +64,7 @@ def list_models(folder: Path, *, as_json: bool) -> None:
     if as_json:
         print(json.dumps({"repository": str(folder), "bundles": rows}, indent=2))
         return
-    table = Table(title=f"with palpate, and in {folder}", title_justify="left")
+    table = Table(title=cell(f"with palpate, and in {folder}"), title_justify="left")
     for column in ("bundle", "task", "sha256", "trained on", "metrics"):
         table.add_column(column, overflow="fold")
     for row in rows:
@@ -160,22 +160,26 @@ def change_model(
 ) -> None:
     """Give a command to the service that ``service`` names, and print what it serves then.
 
-    ``service`` None means that of the bundle's task, else features; for ``LIST`` every service that
-    runs. ``token`` None is that of the station, as the ``profile`` or the default says where.
+    ``service`` None means that of the bundle's task; for ``LIST`` every service that runs; else the
+    only one that runs. ``token`` None is that of the station, as the ``profile`` or the default
+    says where.
 
     Raises:
-        ConfigError: The token cannot be read, or the bundle's task is not known here.
+        ConfigError: The token cannot be read, the bundle's task is not known here, or several
+            services run and none is named.
         LinkError: The service does not run.
+        StreamTimeout: The service does not answer in time.
         RemoteError: The service refuses.
     """
     kept = ModelsConfig() if profile is None else profile.models
     secret = read_token(token_file(kept.memory_folder, station) if token is None else token)
     with Session.open(link, station=station) as session:
         admin = ModelAdmin(session, secret)
+        wrong: dict[str, PalpateError] = {}
         if action is ModelAction.LIST:
-            found = _served(admin, SERVICES if service is None else (service,))
+            found, wrong = _served(admin, SERVICES if service is None else (service,))
         else:
-            name = service or (_service_of(bundle, kept) if bundle else SERVICES[0])
+            name = service or (_service_of(bundle, kept) if bundle else _only_service(admin))
             if action is ModelAction.LOAD:
                 found = {name: admin.load(name, bundle, sensor=sensor)}
             elif action is ModelAction.UNLOAD:
@@ -184,7 +188,10 @@ def change_model(
                 found = {name: admin.roll_back(name, sensor=sensor)}
         named = action is ModelAction.LOAD and sensor != ""
         absent = named and not session.serves(endpoints.TARE, sensor=sensor)
-    _show(found, as_json=as_json)
+    if found:
+        _show(found, as_json=as_json)
+    for error in wrong.values():
+        raise error
     if absent:  # it may come later; but a name may be misspelt, too
         sys.stderr.write(
             f"note: no gateway has sensor {sensor!r} at present; it will have this bundle when one "
@@ -197,19 +204,38 @@ def _service_of(bundle: str, kept: ModelsConfig) -> str:
     return read_manifest(Repository(kept.repository_folder).resolve(bundle)).task
 
 
-def _served(admin: ModelAdmin, services: tuple[str, ...]) -> dict[str, tuple[ModelInventory, ...]]:
-    found, silent = {}, None
+def _served(
+    admin: ModelAdmin, services: tuple[str, ...]
+) -> tuple[dict[str, tuple[ModelInventory, ...]], dict[str, PalpateError]]:
+    """What serves at each service that runs; and of those that run and do not tell it, why."""
+    found, wrong, absent = {}, {}, None
     for service in services:
         try:
             found[service] = admin.served(service)
         except LinkError as error:
-            silent = error
-    if not found and silent is not None:
+            absent = error
+        except PalpateError as error:
+            wrong[service] = error
+    if not found and not wrong and absent is not None:
         if len(services) == 1:
-            raise silent
+            raise absent
         # Which of them the station should have is not known here.
-        raise LinkError(f"none of the services {', '.join(services)} answers", remedy=silent.remedy)
-    return found
+        raise LinkError(f"none of the services {', '.join(services)} answers", remedy=absent.remedy)
+    return found, wrong
+
+
+def _only_service(admin: ModelAdmin) -> str:
+    """The service with models that runs; which of several is meant has to be said."""
+    found, wrong = _served(admin, SERVICES)
+    running = [service for service in SERVICES if service in {*found, *wrong}]
+    if len(running) == 1:
+        return running[0]
+    if not found:
+        raise next(iter(wrong.values()))
+    raise ConfigError(
+        f"the services {', '.join(running)} run, and the command does not say which it is for",
+        remedy=f"name one: --service {' | '.join(running)}",
+    )
 
 
 def _show(found: dict[str, tuple[ModelInventory, ...]], *, as_json: bool) -> None:
@@ -229,13 +255,13 @@ def _show(found: dict[str, tuple[ModelInventory, ...]], *, as_json: bool) -> Non
         for one in inventories:
             name = service if one.instance == service else f"{service}/{one.instance}"
             for served in one.served:
-                bundle = f"{served.name}:{served.version}" if served.name else "[red]none[/]"
+                bundle = cell(f"{served.name}:{served.version}") if served.name else "[red]none[/]"
                 table.add_row(
                     name,
                     served.sensor or "all others",
                     bundle,
                     served.bundle_sha256.hex()[:12],
-                    served.previous or "-",
+                    cell(served.previous or "-"),
                 )
     Console().print(table)
     for inventories in found.values():

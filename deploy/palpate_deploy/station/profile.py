@@ -30,6 +30,7 @@ from palpate.config import (
     config_error,
     endpoint_host_port,
     is_loopback,
+    looking_at,
 )
 from palpate.errors import ConfigError
 from palpate_deploy.station.logs import LogFormat, LogLevel
@@ -229,15 +230,18 @@ def profile_path(profile: str | Path) -> Path:
     """File of a profile given by name (``demo``) or by path (``./mine.toml``).
 
     Raises:
-        ConfigError: There is no such profile; the error lists what exists.
+        ConfigError: There is no such profile, where the error lists what exists; or another user's
+            folder is closed.
     """
     text = str(profile)
     if "/" in text or text.endswith(".toml"):
         path = Path(text).expanduser()
-        if path.is_file():
-            return path
+        with looking_at(path):
+            if path.is_file():
+                return path
+            why = "is no file" if path.exists() else "does not exist"
         raise ConfigError(
-            f"profile {path} {'is no file' if path.exists() else 'does not exist'}",
+            f"profile {path} {why}",
             remedy=f"check the path, or use one by name: {', '.join(profile_names())}",
         )
     path = PROFILES / f"{text}.toml"

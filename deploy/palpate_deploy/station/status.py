@@ -198,11 +198,11 @@ def _print(
     console.print(_table(station, census))
     for process in census:
         for line in clock_lines(process.status) if process.status is not None else ():
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+            console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
     for one in found:
         problem = f"{process_name(one.service, one.instance)}: {one.problem}"
-        console.print(Text(problem, style="red"), soft_wrap=True)
-        console.print(Text(f"  fix: {one.remedy}"), soft_wrap=True)
+        console.print(Text(printable(problem), style="red"), soft_wrap=True)
+        console.print(Text(printable(f"  fix: {one.remedy}")), soft_wrap=True)
     if census and not source:
         console.print(
             "what should run here is not known: no `palpate up` answers; name a --profile",
@@ -239,7 +239,7 @@ def _table(station: str, census: Iterable[ProcessReport]) -> Table:
     for column in ("process", "ready", "state", "up", "sensors", "says", "counters"):
         table.add_column(column, overflow="fold")
     for process in census:
-        name = process_name(process.service, process.instance)
+        name = cell(process_name(process.service, process.instance))
         ready = "[green]yes[/]" if process.ready else "[yellow]no[/]"
         status = process.status
         if status is None:
@@ -255,7 +255,7 @@ def _table(station: str, census: Iterable[ProcessReport]) -> Table:
             duration_text(status.uptime_s),
             _sensors(status),
             cell(status.message),
-            shown_counters(status),
+            cell(shown_counters(status)),
         )
     return table
 
@@ -268,7 +268,7 @@ def _sensors(status: Status) -> str:
         colour = _SENSOR_COLOURS.get(sensor.state, "yellow")
         said = f" [dim]({cell(sensor.message)})[/]" if sensor.message else ""
         lines.append(f"{cell(sensor.name)} [{colour}]{state}[/]{said}")
-    return "\n".join(lines) or " ".join(status.sensors)
+    return "\n".join(lines) or cell(" ".join(status.sensors))
 
 
 def _as_json(

@@ -220,7 +220,7 @@ def _stage_table(processes: Sequence[ProcessActivity]) -> Table | None:
     stages = [*(stage for stage in _STAGES if stage in found), *sorted(found - {*_STAGES})]
     if not stages:
         return None
-    table = _table("p50/p99 ms", *(f"{_STAGES.get(stage, stage)}> " for stage in stages))
+    table = _table("p50/p99 ms", *(f"{_STAGES.get(stage, cell(stage))}> " for stage in stages))
     for one, latencies in timed:
         if latencies:
             cells = [latencies.get(stage) for stage in stages]
@@ -237,7 +237,7 @@ def _drop_lines(
     for name, drops in [*lines, *((one.name, one.drops) for one in sensors)]:
         if drops:
             words = "  ".join(_drop(reason, of) for reason, of in drops.items())
-            yield Text.assemble((f"{name} lost: ", "bold"), words)
+            yield Text.assemble((printable(f"{name} lost: "), "bold"), printable(words))
 
 
 def _drop(reason: str, of: DropCount) -> str:
@@ -247,8 +247,9 @@ def _drop(reason: str, of: DropCount) -> str:
 
 def _trouble_lines(found: Sequence[Trouble]) -> Iterator[Text]:
     for one in found:
-        yield Text(f"{process_name(one.service, one.instance)}: {one.problem}", style="red")
-        yield Text(f"  fix: {one.remedy}")
+        problem = f"{process_name(one.service, one.instance)}: {one.problem}"
+        yield Text(printable(problem), style="red")
+        yield Text(printable(f"  fix: {one.remedy}"))
 
 
 def _state(state: str) -> str:

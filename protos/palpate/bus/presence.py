@@ -14,6 +14,7 @@ import zenoh
 
 from palpate.bus.topics import live_key
 from palpate.bus.zenoh_session import Declared
+from palpate.config import is_name
 from palpate.process import Closing
 
 _LOOK_S = 1.0
@@ -64,7 +65,10 @@ class Presence(Declared):
 def alive(
     views: Iterable[zenoh.Session], station: str, *, timeout_s: float = 1.0
 ) -> list[AliveService]:
-    """All processes that are alive at a station (``"*"`` = any), by what any of the views knows."""
+    """All processes that are alive at a station (``"*"`` = any), by what any of the views knows.
+
+    Tokens with names that no process of palpate can have are passed over.
+    """
     found: dict[tuple[str, str, str], bool] = {}
     key = live_key(station, "*", "*", "*")
     for view in views:
@@ -74,6 +78,8 @@ def alive(
             *_, where, service, instance, what = str(reply.ok.key_expr).split("/")
             # Two tokens of a process come in any order, and "alive" comes alone until it serves.
             name = (where, service, instance)
+            if not all(map(is_name, name)):
+                continue
             found[name] = found.get(name, False) or what == "ready"
     return [AliveService(*name, ready) for name, ready in sorted(found.items())]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from palpate.config import looking_at
 from palpate.errors import ConfigError
 
 
@@ -26,7 +27,9 @@ def check_output(path: Path | None, option: str, ending: str, *inputs: Path | No
         raise ConfigError(
             f"{option} {path} does not end in {ending}", remedy=f"name a file NAME{ending}"
         )
-    if path.is_dir():
+    with looking_at(path):
+        is_folder = path.is_dir()
+    if is_folder:
         raise ConfigError(f"{option} {path} is a folder", remedy=f"name a file NAME{ending}")
     if any(one is not None and one.resolve() == path.resolve() for one in inputs):
         raise ConfigError(f"{option} {path} is what the command reads", remedy="name another file")
@@ -39,7 +42,8 @@ def check_folder(path: Path, option: str) -> None:
     Raises:
         ConfigError: It is a file, or may not be made or written.
     """
-    there = next(one for one in (path, *path.absolute().parents) if one.exists())
+    with looking_at(path):
+        there = next(one for one in (path, *path.absolute().parents) if one.exists())
     if not there.is_dir():
         raise ConfigError(f"{option}: {there} is no folder", remedy="name another one")
     if not os.access(there, os.W_OK | os.X_OK):

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from palpate.config import check_name
+from palpate.config import check_name, looking_at
 from palpate.errors import BundleError, ConfigError
 from palpate.files.atomic import sync_folder, write_synced
 from palpate.files.bundle import (
@@ -131,14 +131,16 @@ class Repository:
         """Find a bundle's folder by ``name`` (newest version), ``name:version``, or its own path.
 
         Raises:
-            ConfigError: There is no such bundle; the error lists what exists.
+            ConfigError: There is no such bundle, where the error lists what exists; or its folder
+                is closed.
         """
         # Only a slash or a leading dot makes it a path: a folder in the working directory must not
         # replace a packaged bundle of the same name without notice.
         if "/" in bundle or bundle.startswith("."):
             folder = Path(bundle).expanduser()
-            if (folder / MANIFEST).is_file():
-                return folder
+            with looking_at(folder):
+                if (folder / MANIFEST).is_file():
+                    return folder
             raise ConfigError(
                 f"bundle {bundle!r}: no {MANIFEST} in {folder.absolute()}",
                 remedy="give the folder that holds model.onnx, manifest.json and golden.npz",
@@ -213,7 +215,7 @@ class Repository:
         for models in self._folders:
             for folder in models.glob("*/*"):
                 name, version = folder.parent.name, folder.name
-                if _is_place(name, version) and (folder / MANIFEST).is_file():
+                if _is_place(name, version) and _has_manifest(folder):
                     found.setdefault((name, int(version)), folder)
         return found
 
@@ -221,6 +223,13 @@ class Repository:
 def _is_place(name: str, version: str) -> bool:
     """Whether a repository has bundles in ``name/version``."""
     return bool(_VERSION.fullmatch(version) and _NAME.fullmatch(name))
+
+
+def _has_manifest(folder: Path) -> bool:
+    try:
+        return (folder / MANIFEST).is_file()
+    except PermissionError:
+        return True  # another user's: whoever reads it is told
 
 
 def _task_of(folder: Path) -> str | None:

@@ -246,7 +246,7 @@ class ServedModels:
         if "/" in command.bundle or command.bundle.startswith("."):
             _refuse("a bundle is loaded by name, not by path", "palpate model import FOLDER")
         if before is _NOTHING and len(self._serving.assigned) > SENSORS_MOST:
-            _refuse_more(f"{SENSORS_MOST} sensors have a bundle of their own")
+            _refuse_more(f"{SENSORS_MOST} sensors have a bundle of their own", self._task)
         with self._one_load():
             return self._open(command.bundle)
 
@@ -348,7 +348,7 @@ class ServedModels:
             if len(self._loaded()) >= LOADED_MOST:
                 self._forget_previous()
             if len(self._loaded()) >= LOADED_MOST:
-                _refuse_more(f"{LOADED_MOST} bundles are loaded")
+                _refuse_more(f"{LOADED_MOST} bundles are loaded", self._task)
             if bundle.sha256 != tried:
                 bundle = proven(bundle, self._task)
             runtime = load(bundle, self._task)
@@ -401,7 +401,7 @@ class ServedModels:
                 if wanted is not None and not remembered.changed:
                     _log.warning("%s; the profile counts again", error)
                     return Assignment(self._open(wanted), time.time_ns())
-                self._problems[sensor] = _not_again(sensor, current, error)
+                self._problems[sensor] = _not_again(self._task, sensor, current, error)
                 _log.error("%s", self._problems[sensor])
         previous = (
             Choice(remembered.previous, remembered.previous_sha256, None)
@@ -423,13 +423,13 @@ class ServedModels:
         self._owed.clear()
 
 
-def _not_again(sensor: str, choice: Choice, error: PalpateError) -> BundleError:
+def _not_again(service: str, sensor: str, choice: Choice, error: PalpateError) -> BundleError:
     """Why a bundle that served before a restart does not; what to do depends on the sensor."""
     whose, option = (f"sensor {sensor!r}", f" --sensor {sensor}") if sensor else ("all sensors", "")
     return BundleError(
         f"{choice.source} does not serve {whose} again: {error.problem}",
         remedy=f"restore it and start the service again, or: palpate model load NAME{option}, or: "
-        f"palpate model unload{option}",
+        f"palpate model unload --service {service}{option}",
     )
 
 
@@ -471,10 +471,10 @@ def _refuse(problem: str, remedy: str) -> NoReturn:
     raise RemoteError(problem, remedy=f"see {remedy}", code=ErrorCode.INVALID_REQUEST)
 
 
-def _refuse_more(problem: str) -> NoReturn:
+def _refuse_more(problem: str, service: str) -> NoReturn:
     raise RemoteError(
         problem,
-        remedy="unload some: palpate model unload --sensor NAME",
+        remedy=f"unload some: palpate model unload --service {service} --sensor NAME",
         code=ErrorCode.RESOURCE_EXHAUSTED,
     )
 
