@@ -1,9 +1,9 @@
 """The process manager's process: supervisord, bound to the ``palpate`` that started it.
 
-``python -m palpate_deploy.station.supervisord -n -s -c FILE`` is ``supervisord`` with three
+``python -m palpate_deploy.station.supervisord -n -s -c FILE`` is ``supervisord`` with four
 differences: it stops, and stops its processes, when its parent is gone; it notices a dead process
-within a tenth of a second instead of a second, which is a third of the time a restart may take; and
-it kills a process that hangs (``station/watch.py``).
+within a tenth of a second instead of a second, which is a third of the time a restart may take; it
+kills a process that hangs (``station/watch.py``); and it goes on when a full disk refuses its logs.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from supervisor import loggers
 from supervisor.medusa import asyncore_25 as asyncore
 from supervisor.options import ServerOptions
 from supervisor.poller import Poller
@@ -57,6 +58,18 @@ class _Options(ServerOptions):  # type: ignore[misc]
             os.chown = real
 
 
+_report_error = loggers.Handler.handleError
+
+
+def _drop_refused(handler: loggers.Handler) -> None:
+    """Drop a line of a log that the disk refuses; stderr, where supervisor says so, is there, too.
+
+    That would raise in turn, and end supervisord with all its processes.
+    """
+    if not isinstance(sys.exc_info()[1], OSError):
+        _report_error(handler)
+
+
 def _processes(supervisord: Supervisor) -> Iterator[Any]:
     for group in (supervisord.process_groups or {}).values():
         yield from group.processes.values()
@@ -65,6 +78,7 @@ def _processes(supervisord: Supervisor) -> Iterator[Any]:
 def main() -> None:
     """Run supervisord with the arguments of this process."""
     end_with_parent()
+    loggers.Handler.handleError = _drop_refused
     os.environ[PARENT_PID] = str(os.getpid())  # its processes live by it
     options = _Options()
     options.poller = _WatchfulPoller(options)
@@ -81,7 +95,8 @@ def main() -> None:
     with contextlib.suppress(asyncore.ExitNow):
         supervisord.main()
     options.close_httpservers()
-    options.close_logger()
+    with contextlib.suppress(OSError):
+        options.close_logger()
     # Here too, because a `palpate up` that was killed cannot do it.
     shutil.rmtree(folder, ignore_errors=True)
 

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -57,7 +58,7 @@ def run_up(profile: Profile, name: str) -> int:
     with contextlib.suppress(MissingExtraError):  # for this check only: no process needs it
         # Not who may read the keys: those that systemd hands over seem open to a group.
         check_certificates(profile, private=False)
-    console = Console()
+    console = _LossyConsole()
     manager = ServiceManager()
     # A service manager that finds it hanging asks where, before it kills it.
     faulthandler.register(signal.SIGUSR1, all_threads=True)
@@ -80,6 +81,16 @@ def run_up(profile: Profile, name: str) -> int:
         console.print("stopping ...")
     console.print("stopped")
     return 0 if finished is None else finished
+
+
+class _LossyConsole(Console):
+    """Goes on where its output is a file on a full disk."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        try:
+            super().print(*objects, **options)
+        except OSError:
+            del self._buffer[:]
 
 
 class _Screen:
