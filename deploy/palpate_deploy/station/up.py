@@ -24,7 +24,7 @@ from palpate.health import Health, HealthReporter
 from palpate.heartbeat import ServiceManager
 from palpate.messages import ServiceState, Status, SupervisedProcess
 from palpate.process import Closing, ProcessUsage, stop_on_signals
-from palpate_deploy.station.host import join
+from palpate_deploy.station.host import join, names_taken
 from palpate_deploy.station.lifetime import end_with_parent
 from palpate_deploy.station.logs import cell, print_error
 from palpate_deploy.station.processes import check_certificates, check_packages, ended_error
@@ -50,7 +50,7 @@ def run_up(profile: Profile, name: str) -> int:
 
     Raises:
         ConfigError: A process cannot serve what the profile says, or its certificate does not hold.
-        LinkError: The router's port is in use.
+        LinkError: The router's port is in use, or a station of this name runs on this host.
         MissingExtraError: A process needs a package that is not installed.
         SupervisorError: supervisord does not start, dies or hangs.
     """
@@ -64,7 +64,7 @@ def run_up(profile: Profile, name: str) -> int:
     faulthandler.register(signal.SIGUSR1, all_threads=True)
     stop = stop_on_signals()
     end_with_parent()
-    with Supervisor(profile, name) as supervisor:
+    with names_taken(profile), Supervisor(profile, name) as supervisor:
         console.print(
             f"station {profile.station!r} starts: {', '.join(profile.processes)}\n"
             f"router {', '.join(profile.link.connect)}   logs {supervisor.logs}\n"
