@@ -1,14 +1,16 @@
 """The process manager's process: supervisord, bound to the ``palpate`` that started it.
 
-``python -m palpate_deploy.station.supervisord -n -s -c FILE`` is ``supervisord`` with four
+``python -m palpate_deploy.station.supervisord -n -s -c FILE`` is ``supervisord`` with five
 differences: it stops, and stops its processes, when its parent is gone; it notices a dead process
 within a tenth of a second instead of a second, which is a third of the time a restart may take; it
-kills a process that hangs (``station/watch.py``); and it goes on when a full disk refuses its logs.
+kills a process that hangs (``station/watch.py``); it goes on when a full disk refuses its logs; and
+in FILE `` #`` and `` ;`` are part of a path, and begin no comment.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import shutil
 import sys
@@ -17,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from supervisor import loggers
+from supervisor import options as supervisor_options
 from supervisor.medusa import asyncore_25 as asyncore
 from supervisor.options import ServerOptions
 from supervisor.poller import Poller
@@ -80,6 +83,9 @@ def main() -> None:
     end_with_parent()
     loggers.Handler.handleError = _drop_refused
     os.environ[PARENT_PID] = str(os.getpid())  # its processes live by it
+    supervisor_options.UnhosedConfigParser = functools.partial(
+        supervisor_options.UnhosedConfigParser, inline_comment_prefixes=None
+    )
     options = _Options()
     options.poller = _WatchfulPoller(options)
     options.realize(sys.argv[1:], doc=__doc__)

@@ -1,4 +1,4 @@
-"""A station whose disk is full goes on: what its logs cannot take is dropped."""
+"""A station goes on when the disk of its folders is full, and works in folders of any name."""
 
 from __future__ import annotations
 
@@ -22,6 +22,23 @@ WaitUntil = Callable[[Callable[[], bool], float, str], float]
 FULL = Path("/dev/full")
 PATIENCE_S = 60.0
 LOGS = ("supervisord", "router", "gateway")
+
+
+@pytest.mark.slow
+def test_a_folder_may_have_any_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wait_until: WaitUntil
+) -> None:
+    """For supervisord `` #`` and `` ;`` begin a comment, and ``%`` an expansion."""
+    folder = tmp_path / "Lab #2 ;50 %(x)s "
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("XDG_STATE_HOME", str(folder / "state #1"))
+    profile = private_profile("virtual").model_copy(update={"processes": ("router",)})
+    with supervision.Supervisor(profile, "lab ;2 #3") as supervisor:
+        wait_until(lambda: supervisor.processes()[0].served, PATIENCE_S, "the router serves")
+        assert Path(f"/proc/{supervisor.processes()[0].pid}/cwd").readlink() == folder
+        assert (supervisor.logs / "router.log").exists()
+        assert supervisor.logs.is_relative_to(folder)
 
 
 @pytest.mark.slow
