@@ -208,7 +208,7 @@ def _is_up(processes: Sequence[ProcessState]) -> bool:
 def _last_words(known: dict[str, tuple[Status, float]]) -> str:
     status, _ = known.get("gateway", (None, 0.0))
     ended = status is not None and status.state is ServiceState.FINISHED
-    return status.message if status is not None and ended else "all sources have ended"
+    return printable(status.message) if status is not None and ended else "all sources have ended"
 
 
 def _print_changes(
@@ -240,11 +240,11 @@ def _table(processes: list[ProcessState], known: dict[str, tuple[Status, float]]
         says = counters = ""
         if status is not None and time.monotonic() - heard_s < _SILENT_AFTER_S:
             says = f"{state_text(status.state)} {cell(status.message)}"
-            counters = shown_counters(status)
+            counters = cell(shown_counters(status))
             if status.last_error is not None and status.state is ServiceState.DEGRADED:
                 problems.append(
-                    f"{process.service}: {status.last_error.message}\n"
-                    f"  fix: {status.last_error.remedy}"
+                    f"{process.service}: {printable(status.last_error.message)}\n"
+                    f"  fix: {printable(status.last_error.remedy)}"
                 )
         table.add_row(
             process.service,
