@@ -225,7 +225,8 @@ class LinkConfig(StrictConfig):
             through the router: one path, so that nothing is overtaken while a direct link comes
             up. A lossless replay needs that. So it is, too, for who reaches the router at another
             host and listens on loopback only.
-        wait_for_router_s: How long opening waits for a router [s]; negative = no limit (services).
+        wait_for_router_s: How long opening waits for a router [s]; negative = no limit (services),
+            a minute where all data goes through the router.
         lease_s: A peer silent for this long is gone [s].
         wall_clock_error_s: How far the wall clock of another host may be from this host's [s]. A
             reading that seems to come from farther in the future is refused.

@@ -270,8 +270,8 @@ _PART = 2
 def schedule(seed: int, only: str = "") -> Iterator[tuple[Fault, Fault | None, float]]:
     """Faults without end: one, the one that comes during it (None = none), the pause after [s].
 
-    Each kind comes once before any comes twice. systemd gives up on a unit that starts five times
-    in a minute, so those that start it again are kept apart.
+    Each kind comes once before any comes twice. Those that start the unit again are kept apart, so
+    that others meet a station that is up.
     """
     rng = random.Random(seed)
     faults = tuple(one for one in catalogue() if only in one.name)

@@ -21,7 +21,7 @@ import typer
 from typer.testing import CliRunner
 
 from palpate.bus import Session
-from palpate.config import TLS_FILES, LinkConfig, TlsConfig
+from palpate.config import TLS_FILES, LinkConfig, TlsConfig, endpoint_host_port
 from palpate.errors import (
     BundleError,
     ConfigError,
@@ -140,6 +140,23 @@ def test_port_in_use_is_said_before_anything_starts(palpate: Palpate, tmp_path: 
         result = palpate("up", "--profile", path)
     _assert_said(result, 1, f"127.0.0.1:{port} is in use", "palpate status", "[router] listen")
     assert not list((Path(os.environ["XDG_STATE_HOME"])).rglob("supervisord.conf"))
+
+
+@pytest.mark.parametrize("protocol", ["tcp", "tls"])
+@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
+def test_another_port_is_said_as_a_router_listens(protocol: str, host: str) -> None:
+    with socket.socket(socket.AF_INET6 if "[" in host else socket.AF_INET) as taken:
+        try:
+            taken.bind((host.strip("[]"), 0))
+        except OSError:
+            pytest.skip("this host has no IPv6")
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(LinkError, match="in use") as told:
+            check_free([f"{protocol}/{host}:{port}"])
+    (said,) = re.findall(r"LISTEN='\[\"(.*)\"\]'", told.value.remedy)
+    assert said.startswith(f"{protocol}/{host}:")
+    assert endpoint_host_port(said)[1] != port
 
 
 def test_address_of_another_host_cannot_be_listened_at() -> None:

@@ -7,14 +7,49 @@ import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from palpate.errors import RecordingError
 from palpate.files.record import summarise
+from palpate_deploy.demo import demo
+from palpate_deploy.demo.comparison import TouchComparison
+from palpate_deploy.demo.demo import run_demo
+from palpate_deploy.station.host import running_folders
+from palpate_services.recorder import writer
 
 Palpate = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+def test_a_disk_without_room_is_told_before_anything_starts(
+    bundle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "free_bytes", lambda _: 10**6)
+    with pytest.raises(RecordingError, match="1 MB free, a record needs 268 MB"):
+        run_demo(1.0, tmp_path / "demo")
+    assert not running_folders()
+
+
+def test_estimates_without_a_record_are_not_said_to_be_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The disk got full meanwhile."""
+
+    def watch(_: object, __: object, comparison: TouchComparison, *___: object) -> None:
+        comparison.count = 1900
+
+    station = MagicMock()
+    station.__enter__.return_value.log_tail.return_value = "no space left"
+    monkeypatch.setattr(demo, "Supervisor", lambda *_: station)
+    monkeypatch.setattr(demo, "_watch", watch)
+    assert run_demo(1.0, tmp_path / "demo") == 1
+    said = capsys.readouterr().out
+    assert "no record was written" in said
+    assert "no space left" in said
+    assert "no estimate came" not in said
 
 
 @pytest.mark.slow

@@ -29,6 +29,7 @@ from palpate_deploy.station.host import (
     RunDiskError,
     end_run,
     free_endpoint,
+    names_taken,
     new_run_folder,
     private_profile,
     running_folders,
@@ -37,7 +38,7 @@ from palpate_deploy.station.host import (
 )
 from palpate_deploy.station.logs import FAILED, exit_code
 from palpate_deploy.station.processes import FiniteRun
-from palpate_deploy.station.profile import parse_profile
+from palpate_deploy.station.profile import Profile, parse_profile
 from palpate_deploy.station.status import show_status
 from palpate_deploy.station.troubles import (
     Expectation,
@@ -304,6 +305,25 @@ def test_a_start_that_is_refused_leaves_the_run_whose_name_it_has(
         new_run_folder("lab")
     assert running_folders() == [running]
     end_run(running)
+
+
+def test_two_stations_of_one_name_do_not_run_on_one_host(tmp_path: Path) -> None:
+    """Each would overwrite what the other remembers of its models."""
+
+    def station(**keys: object) -> Profile:
+        return parse_profile({"processes": ["features", "fem"], **keys}, where="test")
+
+    with names_taken(station()):
+        with pytest.raises(LinkError, match="station 'lab' runs already on this host") as told:
+            with names_taken(station(link={"connect": ["tcp/127.0.0.1:7448"]})):
+                pass
+        assert "station in the profile" in told.value.remedy
+        others = ({"replica": "b"}, {"station": "arm2"}, {"processes": ["gateway"]})
+        for other in (*others, {"models": {"state": str(tmp_path / "elsewhere")}}):
+            with names_taken(station(**other)):
+                pass
+    with names_taken(station()):
+        pass
 
 
 def test_a_run_of_an_older_palpate_is_told_by_its_process() -> None:

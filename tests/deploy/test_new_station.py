@@ -23,7 +23,14 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from palpate.errors import ConfigError, LinkError, StreamTimeout
+from palpate.errors import (
+    ConfigError,
+    ErrorCode,
+    LinkError,
+    PalpateError,
+    RemoteError,
+    StreamTimeout,
+)
 from palpate.messages import ModelInventory, QualityFlag, ServedModel
 from palpate_deploy.cli.app import app
 from palpate_deploy.station import first_hour, new_station
@@ -563,24 +570,37 @@ class TestZero:
             first_hour.zero_wrench(session, tare)
 
 
-def test_a_session_that_does_not_know_yet_who_answers_asks_again(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    "refusal",
+    [
+        LinkError("no service answers", remedy="start the service"),
+        StreamTimeout("no answer in time", remedy="it hangs"),
+        RemoteError("cannot tare it: E6 varies", remedy="let go", code=ErrorCode.DEVICE),
+    ],
+)
+def test_a_finger_that_is_not_tared_yet_is_asked_again(
+    monkeypatch: pytest.MonkeyPatch, refusal: PalpateError
 ) -> None:
+    """It may be touched just then, and a gateway may be unknown yet, or hang."""
     asked: list[str] = []
     tare = MagicMock()
+    said = Console(file=io.StringIO(), record=True)
 
     def ask(*_: object, **__: object) -> object:
         asked.append("")
         if len(asked) < 3:
-            raise LinkError("no service answers", remedy="start the service")
+            raise refusal
         return tare
 
     def tare_at_rest() -> object:
-        return tare_module.tare_at_rest(MagicMock(), "finger", threading.Event(), again_s=0.0)
+        return tare_module.tare_at_rest(
+            MagicMock(), "finger", threading.Event(), again_s=0.0, console=said
+        )
 
     monkeypatch.setattr(tare_module, "ask_tare", ask)
     assert tare_at_rest() is tare
+    assert said.export_text() == f"not yet: {refusal.problem}; trying for 60 s\n", "once"
     monkeypatch.setattr(tare_module, "LET_GO_S", 0.0)
     asked.clear()
-    with pytest.raises(LinkError):
+    with pytest.raises(type(refusal)):
         tare_at_rest()

@@ -143,7 +143,7 @@ def test_a_station_answers_every_command(
     assert "nothing came of sensor 'elbow'" in nothing.stderr
     second = palpate("up", "--profile", profile)
     assert second.returncode == 1
-    assert "is in use" in second.stderr
+    assert "station 'test' runs already on this host" in second.stderr
 
 
 def test_status_misses_what_should_run(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 from rich.console import Console
 
+from palpate.errors import ErrorCode
+from palpate.messages import ErrorReply, ServiceState, Status
 from palpate_deploy.station.supervision import ProcessState, recent
-from palpate_deploy.station.up import _is_up, _print_changes, _table
+from palpate_deploy.station.up import _is_up, _last_words, _print_changes, _table
 
 FINE = ProcessState("gateway", "RUNNING", 10, 900.0, 0, 0, True, 0, "")
 HUNG = ProcessState("features", "RUNNING", 12, 30.0, 3, 1, True, -9, "hung: no heartbeat for 5.0 s")
@@ -50,3 +53,28 @@ def test_a_station_is_up_with_its_router_and_something_that_serves() -> None:
     assert not _is_up([replace(again, service=name) for name in ("router", "gateway", "features")])
     assert not _is_up([replace(again, service=name) for name in ("gateway", "features")])
     assert _is_up([replace(FINE, state="EXITED"), router]), "a recording has come to its end"
+
+
+def test_no_text_of_a_process_acts_on_the_terminal_or_ends_the_screen() -> None:
+    """Any local process may send one."""
+    acts = "\x1b]0;owned\x07[/]"
+    error = ErrorReply(ErrorCode.INTERNAL, acts, acts, 0.0)
+    status = Status(
+        "gateway",
+        "gateway",
+        ServiceState.DEGRADED,
+        10**9,
+        10**9,
+        5.0,
+        "1",
+        counters={f"lost{acts}": 1},
+        message=acts,
+        last_error=error,
+    )
+    console = Console(width=160, force_terminal=True)
+    with console.capture() as shown:
+        console.print(_table([FINE], {"gateway": (status, time.monotonic())}))
+    assert "owned" in shown.get()
+    assert "\x1b]0" not in shown.get()
+    finished = replace(status, state=ServiceState.FINISHED)
+    assert "\x1b" not in _last_words({"gateway": (finished, 0.0)})

@@ -151,6 +151,14 @@ def test_wrong_profile_is_not_started_again_and_again(units: Units) -> None:
         assert UnitFile.read(unit).one("RestartPreventExitStatus") == "2"
 
 
+def test_a_station_is_tried_until_its_disk_has_room_again(units: Units) -> None:
+    """A full disk ends each start within seconds: a limit of starts would be reached at once."""
+    for unit in units.values():
+        settings = UnitFile.read(unit)
+        assert settings.one("Restart") == "on-failure"
+        assert settings.one("StartLimitIntervalSec") == "0"
+
+
 _DOUBLE = """
 import ctypes, sys
 PR_SET_MDWE = 65

@@ -23,7 +23,7 @@ from palpate_deploy.demo.comparison import (
     TouchMoment,
 )
 from palpate_deploy.diagnose.records import error_lines, viewer_command
-from palpate_deploy.station.host import private_profile
+from palpate_deploy.station.host import check_room, private_profile
 from palpate_deploy.station.logs import FAILED
 from palpate_deploy.station.profile import Profile
 from palpate_deploy.station.supervision import Supervisor
@@ -38,9 +38,12 @@ _FIRST_S = 60.0
 
 
 def run_demo(seconds: float, out: Path) -> int:
-    """Run the demo until ``seconds`` after the first estimates; the exit code, 1 if none came.
+    """Run the demo until ``seconds`` after the first estimates; the exit code.
+
+    It is 1 if no estimate came, or no record was written.
 
     Raises:
+        RecordingError: ``out`` has no room for a record.
         PalpateError: The demo cannot start.
     """
     from palpate_services.inference.repository import resolve
@@ -49,6 +52,7 @@ def run_demo(seconds: float, out: Path) -> int:
     profile = private_profile("demo", recorder={"out": str(out)})
     for bundle in (profile.features.bundle, profile.field.bundle, profile.synthesis.bundle):
         resolve(bundle)  # a missing one is an error before anything starts
+    check_room(out, profile.recorder.min_free_bytes)
     before = set(out.glob("*.mcap"))
     stop = stop_on_signals()
     console.print(
@@ -69,6 +73,8 @@ def run_demo(seconds: float, out: Path) -> int:
                 if tail := supervisor.log_tail(service):
                     console.print(f"--- {service}\n{tail}", markup=False)
     records = sorted(set(out.glob("*.mcap")) - before)
+    if comparison.count and not records:
+        console.print(f"--- recorder\n{supervisor.log_tail('recorder')}", markup=False)
     return _report(console, comparison, fields.medians(), records)
 
 
@@ -179,8 +185,11 @@ def _report(
     console: Console, comparison: TouchComparison, fields: FieldMedians, records: list[Path]
 ) -> int:
     """Print errors by force and the paths of the files; write the numbers and the picture."""
-    if not comparison.count or not records:
+    if not comparison.count:
         console.print("no estimate came; see the logs above and try: palpate doctor")
+        return FAILED
+    if not records:
+        console.print("estimates came, but no record was written; see the recorder's log above")
         return FAILED
     record = records[-1]
     errors = read_touches(record, sensor=_SENSOR).errors()

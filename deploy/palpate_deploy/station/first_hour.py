@@ -96,7 +96,9 @@ def walk(order: WalkOrder) -> None:
     with _running(profile, console) as run:
         with join(profile, wait_s=_READY_S, role=Role.OPERATOR) as session:
             console.print("tare: let go of the finger", markup=False)
-            tare = tare_at_rest(session, FINGER, threading.Event(), again_s=_AGAIN_S)
+            tare = tare_at_rest(
+                session, FINGER, threading.Event(), again_s=_AGAIN_S, console=console
+            )
             assert tare is not None, "nothing interrupts it"
             if any(sensor.name == WRENCH_SENSOR for sensor in profile.gateway.sensors):
                 zero_wrench(session, tare)

@@ -100,11 +100,12 @@ def untouched(link: LinkConfig, station: str, sensor: str, console: Console) -> 
     Raises:
         LinkError: There is no router, or no such finger.
         RemoteError: The gateway takes no tare.
+        StreamTimeout: It does not answer.
     """
     with Session.open(link, station=station) as session:
         _first(session, ELECTRODES, sensor, _NO_ELECTRODES)
         console.print("let go of the finger: it is tared", markup=False)
-        tare = tare_at_rest(session, sensor, threading.Event(), again_s=_AGAIN_S)
+        tare = tare_at_rest(session, sensor, threading.Event(), again_s=_AGAIN_S, console=console)
         assert tare is not None, "nothing interrupts it"
         return tare
 
@@ -150,7 +151,7 @@ def record_presses(
         _first(session, WRENCH, sensor, no_force)
         with _recording(link, station, sensor, out) as recording:
             console.print("let go of the finger: it is tared", markup=False)
-            tare_at_rest(session, sensor, interrupted, again_s=_AGAIN_S)
+            tare_at_rest(session, sensor, interrupted, again_s=_AGAIN_S, console=console)
             if not interrupted.is_set():
                 count = _guide(
                     session, sensor, presses, out, interrupted, console, check=recording.check

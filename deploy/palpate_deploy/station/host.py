@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import os
 import shutil
 import socket
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +42,48 @@ def check_free(endpoints: Iterable[str]) -> None:
             _bind(host, port)
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
+                here, _, _ = endpoint.rpartition(":")
                 other = port + 1 if port < 65535 else 7447
                 raise LinkError(
-                    f"{host}:{port} is in use",
+                    f"{endpoint.partition('/')[2]} is in use",
                     remedy="another `palpate up`? Look with `palpate status --connect "
-                    f"{endpoint}`, or choose another port: [router] listen in the profile, or "
-                    f"PALPATE_ROUTER__LISTEN='[\"tcp/{host}:{other}\"]'",
+                    f"{endpoint}`, or choose another port and name: station and [router] listen in "
+                    f"the profile, or PALPATE_ROUTER__LISTEN='[\"{here}:{other}\"]' with "
+                    "PALPATE_STATION=NAME",
                 ) from error
             raise LinkError(
                 f"the router cannot listen at {endpoint}: {error.strerror or error}",
                 remedy="set [router] listen to an address of this host",
             ) from error
+
+
+@contextlib.contextmanager
+def names_taken(profile: Profile) -> Iterator[None]:
+    """Take the names of a profile's processes on this host, for the time of the block.
+
+    Two of one name would overwrite what each remembers of its models.
+
+    Raises:
+        LinkError: A process of that name runs here already, for a station of the same name.
+    """
+    folder = profile.models.memory_folder / "stations" / profile.station
+    with contextlib.ExitStack() as taken:
+        for service in profile.processes:
+            name = profile.instance(service)
+            try:
+                folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+                file = taken.enter_context(open(folder / f"{name}.running", "ab"))
+                # The kernel gives it back when this process ends, however it does.
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise LinkError(
+                    f"station {profile.station!r} runs already on this host: its {name}",
+                    remedy="look with `palpate status`, and stop it; or give this one another "
+                    "name: station in the profile, or a spare's replica",
+                ) from error
+            except OSError:
+                pass  # where nothing can be written, nothing is overwritten
+        yield
 
 
 def check_room(out: Path, least: int) -> None:

@@ -246,7 +246,6 @@ class Supervisor:
         finite = service == "gateway" and self.profile.gateway.exit_at_end
         return {
             "command": _escaped(shlex.join(command_line(service, profile))),
-            "directory": _escaped(str(Path.cwd())),
             "priority": str(priority),
             "autostart": "true",
             "autorestart": "unexpected" if finite else "true",
@@ -259,7 +258,8 @@ class Supervisor:
             "stopasgroup": "false",
             "killasgroup": "true",
             "redirect_stderr": "true",
-            "stdout_logfile": _escaped(str(self.logs / f"{service}.log")),
+            # Of this one supervisor expands the text twice.
+            "stdout_logfile": _escaped(_escaped(str(self.logs / f"{service}.log"))),
             "stdout_logfile_maxbytes": "10MB",
             "stdout_logfile_backups": "3",
         }

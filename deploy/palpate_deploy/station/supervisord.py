@@ -1,14 +1,16 @@
 """The process manager's process: supervisord, bound to the ``palpate`` that started it.
 
-``python -m palpate_deploy.station.supervisord -n -s -c FILE`` is ``supervisord`` with three
+``python -m palpate_deploy.station.supervisord -n -s -c FILE`` is ``supervisord`` with five
 differences: it stops, and stops its processes, when its parent is gone; it notices a dead process
-within a tenth of a second instead of a second, which is a third of the time a restart may take; and
-it kills a process that hangs (``station/watch.py``).
+within a tenth of a second instead of a second, which is a third of the time a restart may take; it
+kills a process that hangs (``station/watch.py``); it goes on when a full disk refuses its logs; and
+in FILE `` #`` and `` ;`` are part of a path, and begin no comment.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import shutil
 import sys
@@ -16,6 +18,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from supervisor import loggers
+from supervisor import options as supervisor_options
 from supervisor.medusa import asyncore_25 as asyncore
 from supervisor.options import ServerOptions
 from supervisor.poller import Poller
@@ -57,6 +61,18 @@ class _Options(ServerOptions):  # type: ignore[misc]
             os.chown = real
 
 
+_report_error = loggers.Handler.handleError
+
+
+def _drop_refused(handler: loggers.Handler) -> None:
+    """Drop a line of a log that the disk refuses; stderr, where supervisor says so, is there, too.
+
+    That would raise in turn, and end supervisord with all its processes.
+    """
+    if not isinstance(sys.exc_info()[1], OSError):
+        _report_error(handler)
+
+
 def _processes(supervisord: Supervisor) -> Iterator[Any]:
     for group in (supervisord.process_groups or {}).values():
         yield from group.processes.values()
@@ -65,7 +81,11 @@ def _processes(supervisord: Supervisor) -> Iterator[Any]:
 def main() -> None:
     """Run supervisord with the arguments of this process."""
     end_with_parent()
+    loggers.Handler.handleError = _drop_refused
     os.environ[PARENT_PID] = str(os.getpid())  # its processes live by it
+    supervisor_options.UnhosedConfigParser = functools.partial(
+        supervisor_options.UnhosedConfigParser, inline_comment_prefixes=None
+    )
     options = _Options()
     options.poller = _WatchfulPoller(options)
     options.realize(sys.argv[1:], doc=__doc__)
@@ -81,7 +101,8 @@ def main() -> None:
     with contextlib.suppress(asyncore.ExitNow):
         supervisord.main()
     options.close_httpservers()
-    options.close_logger()
+    with contextlib.suppress(OSError):
+        options.close_logger()
     # Here too, because a `palpate up` that was killed cannot do it.
     shutil.rmtree(folder, ignore_errors=True)
 

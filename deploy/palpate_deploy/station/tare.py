@@ -6,11 +6,12 @@ import threading
 import time
 
 import numpy as np
+from rich.console import Console
 
 from palpate.bus import Session, endpoints
 from palpate.client.estimates import ask_tare, ask_zero
 from palpate.config import LinkConfig
-from palpate.errors import LinkError, RemoteError, printable
+from palpate.errors import LinkError, RemoteError, StreamTimeout, printable
 from palpate.messages import FloatArray, Tare, WrenchZero
 
 LET_GO_S = 60.0
@@ -68,7 +69,12 @@ def take_tare(
 
 
 def tare_at_rest(
-    session: Session, sensor: str, interrupted: threading.Event, *, again_s: float
+    session: Session,
+    sensor: str,
+    interrupted: threading.Event,
+    *,
+    again_s: float,
+    console: Console,
 ) -> Tare | None:
     """Tare a finger as soon as nobody touches it; None = interrupted.
 
@@ -79,18 +85,25 @@ def tare_at_rest(
         sensor: Name of the finger.
         interrupted: Ends the waiting.
         again_s: Time from a refusal, or a question without an answer, to the next one [s].
+        console: Gets a line, once, that says why it is not tared yet.
 
     Raises:
         RemoteError: It is touched for a minute.
         LinkError: Nobody answers for a minute.
+        StreamTimeout: As long as that, a gateway is there and does not answer.
     """
     give_up_s = time.monotonic() + LET_GO_S
+    told = False
     while not interrupted.is_set():
         try:
             return ask_tare(session, sensor, frames=0, timeout_s=_ASK_S)
-        except (LinkError, RemoteError):
+        except (LinkError, RemoteError, StreamTimeout) as error:
             if time.monotonic() >= give_up_s:
                 raise
+            if not told:
+                told = True
+                line = f"not yet: {printable(error.problem)}; trying for {LET_GO_S:.0f} s"
+                console.print(line, markup=False, soft_wrap=True)
             interrupted.wait(again_s)
     return None
 

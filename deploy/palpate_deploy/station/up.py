@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -18,12 +19,19 @@ from rich.text import Text
 from palpate.bus import Delivery, Session, Subscriber
 from palpate.bus.topics import STATUS
 from palpate.census import ROUTER, SUPERVISOR
-from palpate.errors import ConfigError, MissingExtraError, PalpateError, StreamTimeout
+from palpate.errors import (
+    ConfigError,
+    LinkError,
+    MissingExtraError,
+    PalpateError,
+    StreamTimeout,
+    printable,
+)
 from palpate.health import Health, HealthReporter
 from palpate.heartbeat import ServiceManager
 from palpate.messages import ServiceState, Status, SupervisedProcess
 from palpate.process import Closing, ProcessUsage, stop_on_signals
-from palpate_deploy.station.host import join
+from palpate_deploy.station.host import join, names_taken
 from palpate_deploy.station.lifetime import end_with_parent
 from palpate_deploy.station.logs import cell, print_error
 from palpate_deploy.station.processes import check_certificates, check_packages, ended_error
@@ -39,6 +47,7 @@ from palpate_deploy.station.watch import cannot_serve
 
 _REFRESH_S = 0.25
 _SILENT_AFTER_S = 3.0
+_JOIN_S = 2.0
 _STARTED = ("RUNNING", "EXITED")
 
 _STATE_COLOURS = {"RUNNING": "green", "STARTING": "yellow", "STOPPING": "yellow"}
@@ -49,7 +58,7 @@ def run_up(profile: Profile, name: str) -> int:
 
     Raises:
         ConfigError: A process cannot serve what the profile says, or its certificate does not hold.
-        LinkError: The router's port is in use.
+        LinkError: The router's port is in use, or a station of this name runs on this host.
         MissingExtraError: A process needs a package that is not installed.
         SupervisorError: supervisord does not start, dies or hangs.
     """
@@ -57,13 +66,13 @@ def run_up(profile: Profile, name: str) -> int:
     with contextlib.suppress(MissingExtraError):  # for this check only: no process needs it
         # Not who may read the keys: those that systemd hands over seem open to a group.
         check_certificates(profile, private=False)
-    console = Console()
+    console = _LossyConsole()
     manager = ServiceManager()
     # A service manager that finds it hanging asks where, before it kills it.
     faulthandler.register(signal.SIGUSR1, all_threads=True)
     stop = stop_on_signals()
     end_with_parent()
-    with Supervisor(profile, name) as supervisor:
+    with names_taken(profile), Supervisor(profile, name) as supervisor:
         console.print(
             f"station {profile.station!r} starts: {', '.join(profile.processes)}\n"
             f"router {', '.join(profile.link.connect)}   logs {supervisor.logs}\n"
@@ -71,15 +80,22 @@ def run_up(profile: Profile, name: str) -> int:
             soft_wrap=True,
             markup=False,
         )
-        with join(profile, wait_s=-1.0) as session:
-            statuses = session.subscriber(STATUS, delivery=Delivery.QUEUE)
-            with SupervisorReport(session, profile, supervisor.logs) as report:
-                shown = _Screen(console, supervisor, statuses, manager, report)
-                finished = shown.watch(stop)
+        with StationLink(profile, supervisor.logs) as link:
+            finished = _Screen(console, supervisor, manager, link).watch(stop)
         manager.say("STOPPING=1")
         console.print("stopping ...")
     console.print("stopped")
     return 0 if finished is None else finished
+
+
+class _LossyConsole(Console):
+    """Goes on where its output is a file on a full disk."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        try:
+            super().print(*objects, **options)
+        except OSError:
+            del self._buffer[:]
 
 
 class _Screen:
@@ -89,16 +105,15 @@ class _Screen:
         self,
         console: Console,
         supervisor: Supervisor,
-        statuses: Subscriber[Status],
         manager: ServiceManager,
-        report: SupervisorReport,
+        link: StationLink,
     ) -> None:
         self._console = console
         self._supervisor = supervisor
-        self._statuses = statuses
         self._manager = manager
-        self._report = report
+        self._link = link
         self._known: dict[str, tuple[Status, float]] = {}
+        self._absent = ""
         self._before: dict[str, tuple[str, int]] = {}
         self._up = False
         self._running = -1
@@ -114,9 +129,10 @@ class _Screen:
         screen = Live(console=self._console, auto_refresh=False) if terminal else None
         with screen or contextlib.nullcontext():
             while not stop.is_set():
-                _take(self._statuses, self._known, self._supervisor.profile)
+                self._link.take(self._known)
                 processes = self._processes()
-                self._report.tell(processes)
+                self._link.tell(processes)
+                self._say_absent()
                 if screen is not None:
                     screen.update(_table(processes, self._known), refresh=True)
                 else:
@@ -127,6 +143,12 @@ class _Screen:
                     return finished
                 stop.wait(_REFRESH_S)
         return None
+
+    def _say_absent(self) -> None:
+        """Say why the station cannot be joined, each time that it is another reason."""
+        if (absent := self._link.absent) not in ("", self._absent):
+            self._absent = absent
+            self._console.print(f"not linked: {printable(absent)}", markup=False, soft_wrap=True)
 
     def _processes(self) -> list[ProcessState]:
         try:
@@ -186,7 +208,7 @@ def _is_up(processes: Sequence[ProcessState]) -> bool:
 def _last_words(known: dict[str, tuple[Status, float]]) -> str:
     status, _ = known.get("gateway", (None, 0.0))
     ended = status is not None and status.state is ServiceState.FINISHED
-    return status.message if status is not None and ended else "all sources have ended"
+    return printable(status.message) if status is not None and ended else "all sources have ended"
 
 
 def _print_changes(
@@ -207,18 +229,6 @@ def _print_changes(
             )
 
 
-def _take(
-    statuses: Subscriber[Status], known: dict[str, tuple[Status, float]], profile: Profile
-) -> None:
-    while True:
-        try:
-            status = statuses.next(timeout_s=0).message
-        except StreamTimeout:
-            return
-        if status.instance == profile.instance(status.service):
-            known[status.service] = (status, time.monotonic())
-
-
 def _table(processes: list[ProcessState], known: dict[str, tuple[Status, float]]) -> Group:
     table = Table(expand=True)
     for column in ("process", "runs", "pid", "up", "restarts", "says", "counters"):
@@ -230,11 +240,11 @@ def _table(processes: list[ProcessState], known: dict[str, tuple[Status, float]]
         says = counters = ""
         if status is not None and time.monotonic() - heard_s < _SILENT_AFTER_S:
             says = f"{state_text(status.state)} {cell(status.message)}"
-            counters = shown_counters(status)
+            counters = cell(shown_counters(status))
             if status.last_error is not None and status.state is ServiceState.DEGRADED:
                 problems.append(
-                    f"{process.service}: {status.last_error.message}\n"
-                    f"  fix: {status.last_error.remedy}"
+                    f"{process.service}: {printable(status.last_error.message)}\n"
+                    f"  fix: {printable(status.last_error.remedy)}"
                 )
         table.add_row(
             process.service,
@@ -260,6 +270,73 @@ _FINE = frozenset({"RUNNING", "EXITED"})
 
 class ProcessDown(PalpateError, RuntimeError):
     """A process of the station does not run at present."""
+
+
+class StationLink(Closing):
+    """The link of `palpate up` to its station: what the processes say, and the report on them.
+
+    A router elsewhere may be away for long: it is joined in a thread, and tried until it is there.
+
+    Attributes:
+        absent: Why the station could not be joined the last time; empty = it was.
+
+    Raises:
+        LinkError: The address of this process's own listener is in use.
+        ConfigError: Its certificates cannot be used.
+    """
+
+    def __init__(self, profile: Profile, logs: Path) -> None:
+        self.absent = ""
+        self._profile, self._logs = profile, logs
+        self._stop = threading.Event()
+        self._opened = contextlib.ExitStack()
+        self._linked: tuple[Subscriber[Status], SupervisorReport] | None = None
+        self._joining = threading.Thread(target=self._join, name="join", daemon=True)
+        if profile.link.links_directly:  # opens at once, whatever its router does
+            self._open(-1.0)
+        else:
+            self._joining.start()
+
+    def _open(self, wait_s: float) -> None:
+        with contextlib.ExitStack() as undo:
+            session = undo.enter_context(join(self._profile, wait_s=wait_s))
+            statuses = session.subscriber(STATUS, delivery=Delivery.QUEUE)
+            report = undo.enter_context(SupervisorReport(session, self._profile, self._logs))
+            self._opened = undo.pop_all()
+        self._linked = statuses, report
+
+    def _join(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._open(_JOIN_S)
+            except (LinkError, ConfigError) as error:  # also certificates that are being renewed
+                self.absent = error.problem
+                self._stop.wait(_REFRESH_S)
+            else:
+                self.absent = ""
+                return
+
+    def take(self, known: dict[str, tuple[Status, float]]) -> None:
+        """Put each process's newest status, and when it came [s], into ``known``."""
+        while self._linked is not None:
+            try:
+                status = self._linked[0].next(timeout_s=0).message
+            except StreamTimeout:
+                return
+            if status.instance == self._profile.instance(status.service):
+                known[status.service] = (status, time.monotonic())
+
+    def tell(self, processes: Sequence[ProcessState]) -> None:
+        """Report what supervisord says; call it a few times a second."""
+        if self._linked is not None:
+            self._linked[1].tell(processes)
+
+    def close(self) -> None:
+        """Report a last time, withdraw and leave."""
+        self._stop.set()
+        if self._joining.is_alive():
+            self._joining.join()
+        self._opened.close()
 
 
 class SupervisorReport(Closing):
