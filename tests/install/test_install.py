@@ -543,7 +543,7 @@ def test_router_of_a_station_reaches_its_site(root: Path, tmp_path: Path, instal
     install(tmp_path / "lab.toml")
     assert "IPAddressAllow=localhost 192.168.1.2" in (root / UNIT).read_text("utf-8")
     (tmp_path / "lab.toml").write_text(text.replace("192.168.1.2", "site.lab"))
-    with pytest.raises(ConfigError, match="'site.lab' is a name"):
+    with pytest.raises(ConfigError, match=r"'site\.lab' is a name"):
         install(tmp_path / "lab.toml")
 
 
