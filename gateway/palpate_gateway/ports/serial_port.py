@@ -7,6 +7,7 @@ import errno
 import io
 import os
 import select
+import termios
 import time
 from typing import Any
 
@@ -51,7 +52,7 @@ class SerialPort(Port):
         self._line: Any = None
         self._file = self._selectable = False
         self._stuck = False
-        self._broken: tuple[type[Exception], ...] = (OSError,)
+        self._broken: tuple[type[Exception], ...] = (OSError, termios.error)
 
     def open(self) -> None:
         """See ``Port``."""
@@ -59,13 +60,13 @@ class SerialPort(Port):
             return
         serial = require("serial", extra="gateway")
         # Unplugging raises any of these (pyserial issues 341, 331, 86).
-        self._broken = (serial.SerialException, OSError, TypeError)
+        self._broken = (serial.SerialException, OSError, termios.error, TypeError)
         options: dict[str, Any] = {"baudrate": self._baud, "timeout": 0, "rtscts": self._rts_cts}
         if "://" not in self.name:
             options["exclusive"] = True
         try:
             line = serial.serial_for_url(self.name, **options)
-        except (serial.SerialException, OSError, ValueError) as error:
+        except (serial.SerialException, OSError, termios.error, ValueError) as error:
             number = getattr(error, "errno", None) or 0
             raise DeviceError(
                 f"{self.name}: cannot be opened: {error}",
