@@ -39,6 +39,8 @@ _BUFFER = 4 << 20
 """Size of the system's receive buffer [bytes]: its default of 0.2 MB is full after 60 ms of three
 BioTacs."""
 
+_BY_ITSELF = "it is opened again by itself"
+
 
 class CanBatch(NamedTuple):
     """Data frames, and their times of arrival by the host's monotonic clock [ns].
@@ -112,7 +114,8 @@ class CanBus:
         except Exception as error:  # drivers raise whatever their library does
             raise DeviceError(
                 f"{self.name}: cannot join the bus: {error}",
-                remedy="bring it up (ip link set can0 up type can bitrate 1000000), check its name",
+                remedy="bring it up (ip link set can0 up type can bitrate 1000000 restart-ms 100), "
+                "check its name",
             ) from error
 
         self._stamps, self._end = KernelStamps(), None
@@ -217,7 +220,17 @@ class CanBus:
         self.counters["error_frames"] += int(errors.sum())
         if (frames.can_id[errors] & BUS_OFF).any() or (errors.any() and self._is_off()):
             # Reported once, then the bus stays silent: it must be opened again.
-            self._end = self._lost("it is off after too many errors (bus off)")
+            self._end = self._lost("it is off after too many errors (bus off)", self._back_on())
+
+    def _back_on(self) -> str:
+        """What brings the bus back: Linux leaves it off unless it was set up with a restart."""
+        if self._arguments["interface"] != "socketcan":
+            return _BY_ITSELF
+        channel = self._arguments["channel"]
+        return (
+            f"it comes back by itself only if it was set up with restart-ms; else: ip link set "
+            f"{channel} down; ip link set {channel} up"
+        )
 
     def _is_off(self) -> bool:
         with contextlib.suppress(NotImplementedError):
@@ -242,9 +255,8 @@ class CanBus:
             raise DeviceError(f"{self.name} is not open", remedy="call open() first")
         return self._bus
 
-    def _lost(self, why: str) -> DeviceLost:
+    def _lost(self, why: str, then: str = _BY_ITSELF) -> DeviceLost:
         return DeviceLost(
             f"CAN bus {self.name} is gone: {why}",
-            remedy="check adapter, wiring and the terminators at both ends; it is opened again by "
-            "itself",
+            remedy=f"check adapter, wiring and the terminators at both ends; {then}",
         )

@@ -12,6 +12,7 @@ from unittest.mock import ANY
 import pytest
 
 from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate_gateway.ports import can_bus
 from palpate_gateway.ports.can_bus import CanBus
 from palpate_gateway.ports.can_frames import BUS_OFF
 from palpate_gateway.ports.datagrams import BATCH
@@ -132,6 +133,25 @@ def test_bus_off_is_told_after_what_came_before_it(sender: Any, bus: CanBus) -> 
     assert [m.can_id for m in read(bus, 1)] == [6]
 
 
+@pytest.mark.parametrize(
+    ("interface", "remedy"),
+    [("socketcan", "restart-ms.*ip link set can3 down; ip link set can3 up"), ("slcan", "itself$")],
+)
+def test_bus_off_says_what_brings_it_back(
+    monkeypatch: pytest.MonkeyPatch, interface: str, remedy: str
+) -> None:
+    where = {"interface": "virtual", "channel": "off"}
+    monkeypatch.setattr(can_bus, "available", lambda: False)
+    monkeypatch.setattr(can_bus, "open_can", lambda _: can.Bus(**where))
+    bus = CanBus(interface, "can3")
+    bus.open()
+    with can.Bus(**where) as sender:
+        sender.send(can.Message(arbitration_id=BUS_OFF, is_error_frame=True, is_extended_id=False))
+        with pytest.raises(DeviceLost, match=f"bus off.*{remedy}"):
+            bus.read(1.0)
+    bus.close()
+
+
 def test_bus_off_by_the_state_of_the_interface(
     sender: Any, bus: CanBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -171,7 +191,7 @@ def test_whatever_a_driver_raises_loses_the_bus_only(monkeypatch: pytest.MonkeyP
     with pytest.raises(DeviceLost, match="library is unwell"):
         bus.write(1, b"")
     bus.close()
-    monkeypatch.setattr("palpate_gateway.ports.can_bus.open_can", broken)
+    monkeypatch.setattr(can_bus, "open_can", broken)
     with pytest.raises(DeviceError, match="cannot join the bus: library is unwell"):
         bus.open()
 
