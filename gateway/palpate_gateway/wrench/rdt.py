@@ -151,9 +151,11 @@ class CounterClock:
         return counter / self._rate_hz
 
     def _check_restart(self, gained: int, waited_s: float) -> None:
-        went_on = gained >= 0
-        if self._rate_hz is not None:
-            went_on = went_on and abs(gained / self._rate_hz - waited_s) <= _RESTART_S
+        if self._rate_hz is None:
+            # After a restart far behind, the nearer way may be forwards: too far for the time.
+            went_on = 0 <= gained <= wire.LATE_COUNTS * (waited_s + _RESTART_S)
+        else:
+            went_on = gained >= 0 and abs(gained / self._rate_hz - waited_s) <= _RESTART_S
         if not went_on:
             raise DeviceLost(
                 f"{self._name}: its counter did not continue: it was restarted",
