@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from palpate.config import StrictConfig
@@ -187,7 +188,12 @@ class FingerDevice(Device):
             slots, self._early = self._early, None
             if slots is None:
                 slots = finger.take(max(0.0, until - time.monotonic()))
-            self._check_there(finger)
+            good = np.flatnonzero(slots.good)
+            if not len(good):
+                # Only then: what came before the plug was pulled is delivered first.
+                self._check_there(finger)
+            elif finger.absent >= ABSENT_SLOTS:
+                slots = slots.part(0, int(good[-1]) + 1)
             readings = self._assembler.push(slots)
             if readings:
                 observed = finger.source.observed

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
 
-from palpate.errors import DeviceError, DeviceTimeout
+from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.biotac import finger
 from palpate_gateway.biotac.can_fingers import BiotacCan, CanOptions
 from palpate_gateway.biotac.slot_link import SlotSource
 from palpate_gateway.biotac.slots import LineSlots
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.protocols.spi import WordKind
+from palpate_gateway.readings import ElectrodeReading
 
 ROUND = ch.SEQUENCES["biotac_e1_first"]
 
 
 class Line(SlotSource):
-    """A line of one finger whose words are of these kinds, a frame each; then it is silent.
+    """A line of one finger.
 
     Args:
-        kinds: Kind of the words of each frame.
+        always: Kind of all words; None = it is silent.
         counts: Name of a counter that rises at each read.
         opens: Whether it can be opened.
     """
@@ -31,11 +32,14 @@ class Line(SlotSource):
     slot_period_s = 1.0 / ch.SLOT_RATE_HZ
 
     def __init__(
-        self, kinds: Sequence[WordKind] = (), counts: str = "", *, opens: bool = True
+        self, always: WordKind | None = None, counts: str = "", *, opens: bool = True
     ) -> None:
-        self.kinds = list(kinds)
+        self.always = always
+        self.once: list[WordKind] = []
+        """Kinds of the next frames, before those of always."""
+        self.frames = 0
         self._counts, self._opens = counts, opens
-        self._frame = self._reads = 0
+        self._reads = 0
 
     def open(self) -> None:
         self._reads += 1
@@ -53,11 +57,13 @@ class Line(SlotSource):
 
     def read(self, timeout_s: float) -> LineSlots:
         self._reads += 1
-        if not self.kinds:
+        if not self.once:
             time.sleep(0.005)
+        kind = self.once.pop(0) if self.once else self.always
+        if kind is None:
             raise DeviceTimeout("silent", remedy="")
-        kind, k, size = self.kinds.pop(0), self._frame, len(ROUND)
-        self._frame += 1
+        k, size = self.frames, len(ROUND)
+        self.frames += 1
         places = np.arange(size)
         return LineSlots(
             size,
@@ -93,7 +99,7 @@ class TestSilentFinger:
             finger_on(Line()).open()
 
     def test_bad_words_are_not_told_as_silence(self) -> None:
-        device = finger_on(Line([WordKind.DEVICE_ERROR] * 5, counts="device_error_unknown"))
+        device = finger_on(Line(WordKind.DEVICE_ERROR, counts="device_error_unknown"))
         with pytest.raises(DeviceError, match="slots come, but no word of this finger is good"):
             device.open()
         assert device.counters["device_error_unknown"] > 0
@@ -105,10 +111,27 @@ class TestSilentFinger:
         assert device.counters["error_frames"] == 1
 
     def test_counters_stay_when_the_finger_is_closed(self) -> None:
-        device = finger_on(Line([WordKind.GOOD] * 3, counts="parity_errors"))
+        device = finger_on(Line(WordKind.GOOD, counts="parity_errors"))
         device.open()
         device.read(1.0)
         while not device.counters["parity_errors"]:
             time.sleep(0.005)
         device.close()
         assert device.counters["parity_errors"] > 0
+
+    def test_frames_before_the_plug_is_pulled_are_delivered(self) -> None:
+        line = Line(WordKind.GOOD)
+        readings: list[ElectrodeReading] = []
+        with finger_on(line) as device:
+            line.always = None
+            time.sleep(0.05)  # what was under way has come
+            good = line.frames + 5
+            line.once, line.always = [WordKind.GOOD] * 5, WordKind.ABSENT
+            while line.frames < good + 4:
+                time.sleep(0.005)
+            with pytest.raises(DeviceLost, match="no finger answers"):  # noqa: PT012
+                while len(readings) < 100:
+                    readings += device.read(0.1)  # type: ignore[arg-type]
+        frame_s = len(ROUND) * line.slot_period_s
+        assert (good - 1) * frame_s <= readings[-1].time_s < good * frame_s
+        assert not any(reading.missed_before for reading in readings)
