@@ -61,13 +61,30 @@ class CanBatch(NamedTuple):
         return zip(frames.can_id.tolist(), data, self.arrival_ns.tolist(), strict=True)
 
 
+def check_bitrate(interface: str, bitrate: int) -> None:
+    """Refuse a bit rate, other than 0, that would be ignored.
+
+    Args:
+        interface: Kind of bus as python-can names it.
+        bitrate: [bit/s].
+
+    Raises:
+        ValueError: The system sets the rate of such a bus, not palpate.
+    """
+    if bitrate and interface == "socketcan":
+        raise ValueError(
+            "bitrate: the system sets that of a socketcan bus (ip link set can0 type can "
+            f"bitrate {bitrate} restart-ms 100): leave it out"
+        )
+
+
 class CanBus:
     """One bus; opening or closing it twice is harmless.
 
     Args:
         interface: Kind of bus as python-can names it, e.g. ``socketcan``.
         channel: E.g. ``can0``.
-        bitrate: [bit/s]; 0 = as the bus is set up.
+        bitrate: [bit/s]; 0 = as the bus is set up. See ``check_bitrate``.
         options: More of python-can's options, and ``listen``; see ``open_can``.
     """
 

@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.clock.sample_times import ArrivalTimes
-from palpate_gateway.ports.can_bus import CanBus
+from palpate_gateway.ports.can_bus import CanBus, check_bitrate
 from palpate_gateway.ports.serial_port import SerialPort
 from palpate_gateway.protocols import robotous as wire
 from palpate_gateway.protocols.robotous import (
@@ -142,7 +142,7 @@ class RobotousOptions(WrenchOptions):
         baud: Speed that is set in the sensor [bit/s].
         interface: python-can's name of the kind of bus, e.g. ``socketcan``.
         channel: Its name, e.g. ``can0``.
-        bitrate: Bit rate of the bus [bit/s]; 0 = leave its setting.
+        bitrate: Bit rate of the bus [bit/s]; 0 = leave its setting, as ``socketcan`` requires.
         bus_options: Further options of python-can; for ``udp_multicast`` also ``listen``, the
             address of the network that is joined: without it only this host is heard.
         request_id: CAN identifier of requests.
@@ -185,6 +185,7 @@ class RobotousOptions(WrenchOptions):
                 raise ValueError(f"rate_hz {self.rate_hz} is above {highest} for {self.baud} bit/s")
         else:
             RobotousCanDecoder(self.first_id, self.second_id)
+            check_bitrate(self.interface, self.bitrate)
         return self
 
 
