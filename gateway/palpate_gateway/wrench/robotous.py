@@ -37,6 +37,10 @@ from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
 _APART = 0.75
 """Halves that are further apart belong to two samples [periods]."""
 
+_SCATTER_S = 2e-3
+"""But so far apart may be the stamps of two halves of one sample [s]: a stamp scatters by 0.9 ms
+(hardware reference 5.1), and a USB adapter delivers once a millisecond."""
+
 
 class RobotousSerialLine:
     """A serial line to one sensor: requests go out, the data bytes of answers come in."""
@@ -83,7 +87,7 @@ class RobotousCanLine:
         self.name = bus.name
         self._bus = bus
         self._request_id, self._ids = request_id, (first_id, second_id)
-        self._apart_ns = round(1e9 * _APART * period_s)
+        self._apart_ns = round(1e9 * max(_APART * period_s, _SCATTER_S))
         self._first_ns = 0
         self._decoder = RobotousCanDecoder(*self._ids)
 
