@@ -73,7 +73,7 @@ class Line(SlotSource):
             np.zeros(size, int),
             np.full(size, k),
             places,
-            (size * k + places) * self.slot_period_s,
+            (size * k + places).astype(np.float64) * self.slot_period_s,
         )
 
 
