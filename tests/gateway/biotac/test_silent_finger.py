@@ -20,7 +20,7 @@ from palpate_gateway.readings import ElectrodeReading
 ROUND = ch.SEQUENCES["biotac_e1_first"]
 
 
-class Line(SlotSource):
+class SlotLine(SlotSource):
     """A line of one finger.
 
     Args:
@@ -77,7 +77,7 @@ class Line(SlotSource):
         )
 
 
-def finger_on(line: Line) -> BiotacCan:
+def finger_on(line: SlotLine) -> BiotacCan:
     device = BiotacCan(CanOptions())
     device._line = lambda: (id(line), 0, line, 1)  # type: ignore[method-assign]
     return device
@@ -89,29 +89,29 @@ class TestSilentFinger:
         monkeypatch.setattr(finger, "_FIRST_S", 0.2)
 
     def test_what_came_instead_of_slots_is_told_and_stays_counted(self) -> None:
-        device = finger_on(Line(counts="short_slots"))
+        device = finger_on(SlotLine(counts="short_slots"))
         with pytest.raises(DeviceError, match=r"no reading came.*short_slots.*device's page"):
             device.open()
         assert device.counters["short_slots"] > 0
 
     def test_true_silence_names_power_and_wiring(self) -> None:
         with pytest.raises(DeviceError, match=r"no reading came within 0\.2 s -> check power"):
-            finger_on(Line()).open()
+            finger_on(SlotLine()).open()
 
     def test_bad_words_are_not_told_as_silence(self) -> None:
-        device = finger_on(Line(WordKind.DEVICE_ERROR, counts="device_error_unknown"))
+        device = finger_on(SlotLine(WordKind.DEVICE_ERROR, counts="device_error_unknown"))
         with pytest.raises(DeviceError, match="slots come, but no word of this finger is good"):
             device.open()
         assert device.counters["device_error_unknown"] > 0
 
     def test_line_that_cannot_be_opened_keeps_its_counters(self) -> None:
-        device = finger_on(Line(counts="error_frames", opens=False))
+        device = finger_on(SlotLine(counts="error_frames", opens=False))
         with pytest.raises(DeviceError, match="nobody is there"):
             device.open()
         assert device.counters["error_frames"] == 1
 
     def test_counters_stay_when_the_finger_is_closed(self) -> None:
-        device = finger_on(Line(WordKind.GOOD, counts="parity_errors"))
+        device = finger_on(SlotLine(WordKind.GOOD, counts="parity_errors"))
         device.open()
         device.read(1.0)
         while not device.counters["parity_errors"]:
@@ -120,7 +120,7 @@ class TestSilentFinger:
         assert device.counters["parity_errors"] > 0
 
     def test_frames_before_the_plug_is_pulled_are_delivered(self) -> None:
-        line = Line(WordKind.GOOD)
+        line = SlotLine(WordKind.GOOD)
         readings: list[ElectrodeReading] = []
         with finger_on(line) as device:
             line.always = None
