@@ -14,21 +14,25 @@ from tests.gateway.ros_fakes import BEGAN_NS, all_fields, wrench_fields
 from palpate.bus import Session
 from palpate.bus.foreign import ForeignSample
 from palpate.config import LinkConfig, parse_config
-from palpate.errors import DeviceLost, StreamTimeout
+from palpate.errors import DeviceLost, DeviceTimeout, StreamTimeout
 from palpate.messages import Pose
 from palpate.ros.layouts import BIOTAC_ALL, WRENCH_STAMPED, encode
 from palpate.ros.rmw_zenoh import SampleInfo
 from palpate_gateway.device import Device, DeviceIdentity
 from palpate_gateway.drivers import make_device
 from palpate_gateway.emulators.lines import crc16_x25
+from palpate_gateway.ports.sockets import ReceivedBytes
 from palpate_gateway.pose.robot import PoseZenoh
 from palpate_gateway.protocols.bota import BotaFrame
+from palpate_gateway.protocols.netft_xml import NetftSettings
+from palpate_gateway.protocols.rdt import RdtScale
 from palpate_gateway.protocols.ros_hands import decode_hand
 from palpate_gateway.readings import Reading
 from palpate_gateway.ros import subscription
 from palpate_gateway.ros.subscription import RosDevice, RosMessage, RosSubscription, RosTopicOptions
 from palpate_gateway.ros.wrench import decode_wrench
 from palpate_gateway.wrench.bota import BotaOptions, WrenchBota
+from palpate_gateway.wrench.rdt import CounterClock, RdtOptions, WrenchRdt
 
 GOOD = 3
 """Good readings of each batch; behind them the clock goes back for good."""
@@ -109,6 +113,62 @@ def bota_bytes(k: int) -> bytes:
     return b"\xaa" + body + crc16_x25(body).to_bytes(2, "little")
 
 
+class OfDatagrams(WrenchRdt):
+    """Has these datagrams waiting, and a page whose scale was changed meanwhile."""
+
+    datagrams: list[bytes]
+
+    def _connect(self) -> str:
+        waiting = self.datagrams
+
+        def receive(timeout_s: float) -> ReceivedBytes:
+            if not waiting:
+                raise DeviceTimeout("nothing", remedy="wait")
+            return ReceivedBytes(waiting.pop(0), 1)
+
+        self._port = SimpleNamespace(  # type: ignore[assignment]
+            receive=receive, write=lambda _: None, close=lambda: None
+        )
+        self._clock = CounterClock(7000.0, "it")
+        self._scale = RdtScale(1e6, 1e6)
+        self._take(self._port.receive(0.0), self._early)
+        self._interrupted_at = None
+        return "a"
+
+    def _page(self, timeout_s: float) -> NetftSettings:
+        return SimpleNamespace(scale=RdtScale(2e6, 2e6))  # type: ignore[return-value]
+
+
+def of_datagrams(datagrams: Sequence[bytes], **options: Any) -> Device:
+    device = OfDatagrams(RdtOptions(**{"product": "ati_net_ft", **options}))
+    device.datagrams = list(datagrams)
+    return device
+
+
+def rdt_record(number: int, sampled: int, status: int = 0) -> bytes:
+    return struct.pack(">3I6i", number, sampled, status, *(1000,) * 6)
+
+
+RDT = [rdt_record(1 + k, 70_000 + k) for k in range(GOOD)]
+
+
+def rdt_restarts() -> Device:
+    return of_datagrams([*RDT, rdt_record(1, 5)], counts_per_n=1e6, counts_per_n_m=1e6)
+
+
+def rdt_restarts_within_a_datagram() -> Device:
+    more = b"".join([*RDT[1:], rdt_record(1, 5)])
+    return of_datagrams([RDT[0], more], counts_per_n=1e6, counts_per_n_m=1e6)
+
+
+def rdt_has_two_sensors() -> Device:
+    return of_datagrams([*RDT, rdt_record(4, 70_003, 0b1001)], product="onrobot_hex")
+
+
+def rdt_has_another_scale() -> Device:
+    return of_datagrams([*RDT, rdt_record(1, 70_003), rdt_record(2, 70_004)])
+
+
 def pose_zenoh() -> Device:
     away = frame(GOOD, pose=Pose((600.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
     frames = [*(frame(k) for k in range(GOOD)), away]
@@ -132,7 +192,20 @@ def pose_zenoh() -> Device:
     return device
 
 
-@pytest.mark.parametrize("make", [ros_biotac, ros_wrench, bota, bota_boots, pose_zenoh])
+MADE = [
+    ros_biotac,
+    ros_wrench,
+    bota,
+    bota_boots,
+    rdt_restarts,
+    rdt_restarts_within_a_datagram,
+    rdt_has_two_sensors,
+    rdt_has_another_scale,
+    pose_zenoh,
+]
+
+
+@pytest.mark.parametrize("make", MADE)
 def test_readings_before_an_error_are_delivered_and_counted(make: Any) -> None:
     device = make()
     with device:

@@ -28,6 +28,14 @@ def test_unknown_driver_names_the_nearest() -> None:
         drivers.make_device("zzzzzz")
 
 
+@pytest.mark.parametrize("driver", ["biotac_can", "wrench_robotous"])
+def test_bit_rate_that_would_be_ignored_is_refused(driver: str) -> None:
+    bus = {"channel": "can0", "bitrate": 500_000}
+    drivers.make_device(driver, {**bus, "interface": "slcan"})
+    with pytest.raises(ConfigError, match=r"bitrate 500000 restart-ms 100\): leave it out"):
+        drivers.make_device(driver, {**bus, "interface": "socketcan"})
+
+
 def test_unknown_option_names_the_nearest() -> None:
     with pytest.raises(ConfigError, match=r"options of driver 'virtual'.*'sed'.*'seed'"):
         drivers.make_device("virtual", {"sed": 3})

@@ -228,8 +228,8 @@ def _unasked(given: Mapping[str, WantedDevice], *, yes: bool) -> list[WantedDevi
         "no CAN interface is there" + (f"; serial ports: {listed}" if ports else ", nor any port"),
         remedy=f"say what is at which: --biotac 'biotac_bridge line={ports[0][1]['port']}'"
         if ports
-        else "plug the adapter in; ip link set can0 type can bitrate 1000000; ip link set can0 up; "
-        "see it in: palpate gateway list",
+        else "plug the adapter in; ip link set can0 type can bitrate 1000000 restart-ms 100; "
+        "ip link set can0 up; see it in: palpate gateway list",
     )
 
 

@@ -8,14 +8,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.biotac.finger import FingerDevice, FingerOptions
 from palpate_gateway.biotac.slot_link import SlotSource
 from palpate_gateway.biotac.slot_rate import RATE_S, SlotRate
 from palpate_gateway.biotac.slots import LineSlots
-from palpate_gateway.ports.can_bus import CanBus
+from palpate_gateway.ports.can_bus import CanBus, check_bitrate
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.protocols.can_slots import CAN_FINGERS_MAX, CanSlotDecoder
 from palpate_gateway.protocols.silences import Floats
@@ -41,7 +41,7 @@ class CanOptions(FingerOptions):
     Attributes:
         interface: python-can's kind of bus.
         channel: Which bus.
-        bitrate: [bit/s]; 0 = as the bus is set up.
+        bitrate: [bit/s]; 0 = as the bus is set up, as ``socketcan`` requires.
         bus_options: Further options of python-can; for ``udp_multicast`` also ``listen``, the
             address of the network that is joined: without it only this host is heard.
         can_id: Identifier of the BioTacs' frames; None = the only one whose frames repeat a round
@@ -60,6 +60,11 @@ class CanOptions(FingerOptions):
     fingers: int = Field(default=CAN_FINGERS_MAX, ge=1, le=CAN_FINGERS_MAX)
     slot_rate_hz: float = Field(default=ch.SLOT_RATE_HZ, gt=0.0, le=10_000.0)
     gather_s: float = Field(default=0.02, ge=0.0, le=0.1)
+
+    @model_validator(mode="after")
+    def _fits(self) -> CanOptions:
+        check_bitrate(self.interface, self.bitrate)
+        return self
 
 
 class CanSource(SlotSource):

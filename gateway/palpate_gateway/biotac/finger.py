@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from palpate.config import StrictConfig
@@ -16,7 +17,7 @@ from palpate.messages import BIOTAC_SP_LAYOUT, Origin, SensorType
 from palpate_gateway.biotac.frames import FrameAssembler
 from palpate_gateway.biotac.slot_link import FingerQueue, SlotLink, SlotSource
 from palpate_gateway.biotac.slots import SlotBlock
-from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo, SerialOption
+from palpate_gateway.device import Device, DeviceIdentity, DeviceInfo, SerialOption, silence_of
 from palpate_gateway.protocols import channels as ch
 from palpate_gateway.readings import Reading
 
@@ -108,6 +109,7 @@ class FingerDevice(Device):
         self._options = options
         self._finger: FingerQueue | None = None
         self._line_before: Mapping[str, int] = {}
+        self._line_last: Mapping[str, int] = {}
         self._early: SlotBlock | None = None
         self._assembler = FrameAssembler(1.0 / ch.SLOT_RATE_HZ)
 
@@ -117,16 +119,22 @@ class FingerDevice(Device):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Counters of frames, of the line, and of slots that this process was too slow to take."""
+        """Counters of frames, of the line, and of slots that this process was too slow to take.
+
+        They stay after closing, and after an opening that failed.
+        """
+        # Those of the line are exact where both have one: the assembler takes any bad word for a
+        # parity error, and sees no slot that the line has dropped.
+        return {**self._assembler.counters, **self._line_counters()}
+
+    def _line_counters(self) -> Mapping[str, int]:
         finger = self._finger
         if finger is None:
-            return self._assembler.counters
+            return self._line_last
         before = self._line_before
         line = finger.source.counters(finger.index).items()
         since = {name: count - before.get(name, 0) for name, count in line}
-        # Those of the line are exact where both have one: the assembler takes any bad word for a
-        # parity error, and sees no slot that the line has dropped.
-        return {**self._assembler.counters, **since, "dropped_slots": finger.dropped}
+        return {**since, "dropped_slots": finger.dropped}
 
     def _open(self) -> DeviceIdentity:
         key, settings, source, ports = self._line()
@@ -136,7 +144,12 @@ class FingerDevice(Device):
                 f"{self.info.model}: the line has {ports} ports", remedy="correct port or fingers"
             )
         self._assembler = FrameAssembler(1.0 / ch.SLOT_RATE_HZ)  # its counters begin anew
-        finger = SlotLink.join(key, settings, source, port - 1)
+        self._line_last = {}
+        try:
+            finger = SlotLink.join(key, settings, source, port - 1)
+        except DeviceError:
+            self._line_last = source.counters(port - 1)
+            raise
         # Other fingers may have the line open for long.
         self._line_before = finger.source.counters(finger.index)
         self._finger = finger
@@ -156,6 +169,7 @@ class FingerDevice(Device):
         )
 
     def _close(self) -> None:
+        self._line_last = self._line_counters()
         finger, self._finger = self._finger, None
         if finger is not None:
             finger.leave()
@@ -174,7 +188,12 @@ class FingerDevice(Device):
             slots, self._early = self._early, None
             if slots is None:
                 slots = finger.take(max(0.0, until - time.monotonic()))
-            self._check_there(finger)
+            good = np.flatnonzero(slots.good)
+            if not len(good):
+                # Only then: what came before the plug was pulled is delivered first.
+                self._check_there(finger)
+            elif finger.absent >= ABSENT_SLOTS:
+                slots = slots.part(0, int(good[-1]) + 1)
             readings = self._assembler.push(slots)
             if readings:
                 observed = finger.source.observed
@@ -199,14 +218,27 @@ class FingerDevice(Device):
             except DeviceTimeout as error:
                 if answered:
                     return SlotBlock.joined(came)
-                raise DeviceError(
-                    f"{self.info.model}: no slot within {_FIRST_S:g} s",
-                    remedy="check power, wiring and bit rate, and that the sender is on",
-                ) from error
+                raise self._no_word(bool(came)) from error
             answered = answered or bool(came[-1].good.any())
             if answered and sum(map(len, came)) >= LEARNT_FROM:
                 return SlotBlock.joined(came)
             self._check_there(finger)
+
+    def _no_word(self, slots_came: bool) -> DeviceError:
+        if slots_came:
+            return DeviceError(
+                f"{self.info.model}: slots come, but no word of this finger is good",
+                remedy="look its counters up on the device's page (parity_errors, device_error_...)"
+                "; check its cable and 'port'",
+            )
+        problem, remedy = silence_of(
+            self.info.model,
+            _FIRST_S,
+            self.counters,
+            {},
+            "check power, wiring and bit rate, and that the sender is on",
+        )
+        return DeviceError(problem, remedy=remedy)
 
     def _check_there(self, finger: FingerQueue) -> None:
         if finger.absent >= ABSENT_SLOTS:

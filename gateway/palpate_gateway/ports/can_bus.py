@@ -39,6 +39,8 @@ _BUFFER = 4 << 20
 """Size of the system's receive buffer [bytes]: its default of 0.2 MB is full after 60 ms of three
 BioTacs."""
 
+_BY_ITSELF = "it is opened again by itself"
+
 
 class CanBatch(NamedTuple):
     """Data frames, and their times of arrival by the host's monotonic clock [ns].
@@ -59,13 +61,30 @@ class CanBatch(NamedTuple):
         return zip(frames.can_id.tolist(), data, self.arrival_ns.tolist(), strict=True)
 
 
+def check_bitrate(interface: str, bitrate: int) -> None:
+    """Refuse a bit rate, other than 0, that would be ignored.
+
+    Args:
+        interface: Kind of bus as python-can names it.
+        bitrate: [bit/s].
+
+    Raises:
+        ValueError: The system sets the rate of such a bus, not palpate.
+    """
+    if bitrate and interface == "socketcan":
+        raise ValueError(
+            "bitrate: the system sets that of a socketcan bus (ip link set can0 type can "
+            f"bitrate {bitrate} restart-ms 100): leave it out"
+        )
+
+
 class CanBus:
     """One bus; opening or closing it twice is harmless.
 
     Args:
         interface: Kind of bus as python-can names it, e.g. ``socketcan``.
         channel: E.g. ``can0``.
-        bitrate: [bit/s]; 0 = as the bus is set up.
+        bitrate: [bit/s]; 0 = as the bus is set up. See ``check_bitrate``.
         options: More of python-can's options, and ``listen``; see ``open_can``.
     """
 
@@ -86,7 +105,9 @@ class CanBus:
         self._direct: tuple[Datagrams, Reader] | None = None
         self._stamps = KernelStamps()
         self._end: DeviceLost | None = None
-        self.counters: dict[str, int] = {"error_frames": 0, "other_frames": 0}
+        self.counters: dict[str, int] = dict.fromkeys(
+            ("error_frames", "other_frames", "bad_lines"), 0
+        )
 
     def open(self) -> None:
         """Join the bus, or do nothing if joined.
@@ -107,10 +128,11 @@ class CanBus:
                 f"{self.name}: {error}",
                 remedy="see python-can's list of interfaces and their options",
             ) from error
-        except (can.CanError, OSError, ImportError) as error:
+        except Exception as error:  # drivers raise whatever their library does
             raise DeviceError(
                 f"{self.name}: cannot join the bus: {error}",
-                remedy="bring it up (ip link set can0 up type can bitrate 1000000), check its name",
+                remedy="bring it up (ip link set can0 up type can bitrate 1000000 restart-ms 100), "
+                "check its name",
             ) from error
 
         self._stamps, self._end = KernelStamps(), None
@@ -158,7 +180,9 @@ class CanBus:
         while True:
             try:
                 frames, arrivals_ns = self._frames(max(0.0, until - time.monotonic()))
-            except (self._can.CanError, OSError, ValueError) as error:
+            except DeviceLost:
+                raise
+            except (OSError, ValueError) as error:
                 raise self._lost(str(error)) from error
             kept = frames.kind == FrameKind.DATA
             if not kept.all():
@@ -189,9 +213,13 @@ class CanBus:
         while len(frames) < BATCH:
             try:
                 message = self._bus.recv(0.0 if frames else wait_s)
-            except (self._can.CanError, OSError, ValueError) as error:
+            except (IndexError, ValueError):
+                # python-can's slcan cannot read a damaged line; the next one may be good.
+                self.counters["bad_lines"] += 1
+                break
+            except Exception as error:  # drivers raise whatever their library does
                 if not frames:
-                    raise
+                    raise self._lost(str(error)) from error
                 # The frames before the error are delivered first.
                 self._end = self._lost(str(error))
                 break
@@ -209,7 +237,17 @@ class CanBus:
         self.counters["error_frames"] += int(errors.sum())
         if (frames.can_id[errors] & BUS_OFF).any() or (errors.any() and self._is_off()):
             # Reported once, then the bus stays silent: it must be opened again.
-            self._end = self._lost("it is off after too many errors (bus off)")
+            self._end = self._lost("it is off after too many errors (bus off)", self._back_on())
+
+    def _back_on(self) -> str:
+        """What brings the bus back: Linux leaves it off unless it was set up with a restart."""
+        if self._arguments["interface"] != "socketcan":
+            return _BY_ITSELF
+        channel = self._arguments["channel"]
+        return (
+            f"it comes back by itself only if it was set up with restart-ms; else: ip link set "
+            f"{channel} down; ip link set {channel} up"
+        )
 
     def _is_off(self) -> bool:
         with contextlib.suppress(NotImplementedError):
@@ -226,7 +264,7 @@ class CanBus:
         message = self._can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
         try:
             bus.send(message, timeout=0.2)
-        except (self._can.CanError, OSError, ValueError) as error:
+        except Exception as error:  # drivers raise whatever their library does
             raise self._lost(str(error)) from error
 
     def _opened(self) -> Any:
@@ -234,9 +272,8 @@ class CanBus:
             raise DeviceError(f"{self.name} is not open", remedy="call open() first")
         return self._bus
 
-    def _lost(self, why: str) -> DeviceLost:
+    def _lost(self, why: str, then: str = _BY_ITSELF) -> DeviceLost:
         return DeviceLost(
             f"CAN bus {self.name} is gone: {why}",
-            remedy="check adapter, wiring and the terminators at both ends; it is opened again by "
-            "itself",
+            remedy=f"check adapter, wiring and the terminators at both ends; {then}",
         )

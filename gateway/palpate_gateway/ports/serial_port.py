@@ -1,11 +1,13 @@
-"""A serial line by pyserial: UART, USB-CDC, an RFC 2217 server or a pseudo terminal."""
+"""A serial line by pyserial: UART, USB-CDC, a pseudo terminal, TCP or an RFC 2217 server."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import select
+import termios
 import time
 from typing import Any
 
@@ -18,6 +20,10 @@ _AT_ONCE = 65536
 
 _TAKEN_S = 1.0
 """Longest time in which the device must take what is written [s]; requests are a few bytes."""
+
+_WAIT_S = 5e-3
+"""Time of one wait for a byte where the system cannot tell that one came [s]: an RFC 2217 server
+is asked for all of its settings again whenever the time changes."""
 
 _POLL_S = 5e-4
 """Time between two looks at what has not left yet [s]: the system does not tell its end."""
@@ -35,7 +41,7 @@ class SerialPort(Port):
 
     Args:
         name: Device file or pyserial URL, e.g. ``/dev/serial/by-id/usb-...`` (which stays the same
-            when plugs change places) or ``socket://host:port``.
+            when plugs change places), ``socket://host:port`` or ``rfc2217://host:port``.
         baud: Rate [bit/s]; nominal on USB-CDC.
         rts_cts: Hardware flow control.
     """
@@ -44,9 +50,9 @@ class SerialPort(Port):
         self.name = name
         self._baud, self._rts_cts = baud, rts_cts
         self._line: Any = None
-        self._file = False
+        self._file = self._selectable = False
         self._stuck = False
-        self._broken: tuple[type[Exception], ...] = (OSError,)
+        self._broken: tuple[type[Exception], ...] = (OSError, termios.error)
 
     def open(self) -> None:
         """See ``Port``."""
@@ -54,13 +60,13 @@ class SerialPort(Port):
             return
         serial = require("serial", extra="gateway")
         # Unplugging raises any of these (pyserial issues 341, 331, 86).
-        self._broken = (serial.SerialException, OSError, TypeError)
+        self._broken = (serial.SerialException, OSError, termios.error, TypeError)
         options: dict[str, Any] = {"baudrate": self._baud, "timeout": 0, "rtscts": self._rts_cts}
         if "://" not in self.name:
             options["exclusive"] = True
         try:
             line = serial.serial_for_url(self.name, **options)
-        except (serial.SerialException, OSError, ValueError) as error:
+        except (serial.SerialException, OSError, termios.error, ValueError) as error:
             number = getattr(error, "errno", None) or 0
             raise DeviceError(
                 f"{self.name}: cannot be opened: {error}",
@@ -71,6 +77,12 @@ class SerialPort(Port):
             line.set_low_latency_mode(True)
         self._line, self._stuck = line, False
         self._file = os.name == "posix" and "://" not in self.name
+        try:
+            line.fileno()
+            self._selectable = True
+        except io.UnsupportedOperation:
+            self._selectable = False
+            line.timeout = _WAIT_S
 
     def close(self) -> None:
         """See ``Port``."""
@@ -94,19 +106,15 @@ class SerialPort(Port):
 
     def _take(self, line: Any, timeout_s: float) -> bytes:
         """Bytes that have arrived, at least one; none if none came in time."""
-        if self._file:
+        if self._selectable:
             # The timeout stays 0: pyserial configures the whole line again whenever it changes.
             ready, _, _ = select.select([line], [], [], timeout_s)
             return bytes(line.read(_AT_ONCE)) if ready else b""
-        waiting = line.in_waiting
-        if waiting:
-            line.timeout = 0
-            return bytes(line.read(min(waiting, _AT_ONCE)))
-        # Wait for one byte, then read the rest that came with it.
-        line.timeout = timeout_s
-        first = line.read(1)
-        line.timeout = 0
-        return bytes(first + line.read(min(line.in_waiting, _AT_ONCE))) if first else b""
+        until = time.monotonic() + timeout_s
+        while True:
+            data = bytes(line.read(min(max(line.in_waiting, 1), _AT_ONCE)))
+            if data or time.monotonic() >= until:
+                return data
 
     def write(self, data: bytes) -> None:
         """See ``Port``."""

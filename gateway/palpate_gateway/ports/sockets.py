@@ -197,8 +197,10 @@ class _Deadline(socket.socket):
     until = 0.0
 
     def recv_into(self, *args: Any, **kwargs: Any) -> int:
-        # Not 0: that would mean not to block.
-        self.settimeout(max(self.until - time.monotonic(), 1e-3))
+        left_s = self.until - time.monotonic()
+        if left_s <= 0.0:  # 0 would mean not to block
+            raise TimeoutError("timed out")
+        self.settimeout(left_s)
         return super().recv_into(*args, **kwargs)
 
 

@@ -238,6 +238,9 @@ _TIMES = 1 << 32
 _LATE_US = 1_000_000
 """By how much slots sent after a HELLO may have been sampled before it [us]."""
 
+_SILENT_US = 10_000_000
+"""Longest time between two packets [us]: a line that is silent for so long is opened again."""
+
 
 @dataclass(slots=True)
 class BridgePacketTrack:
@@ -255,14 +258,17 @@ class BridgePacketTrack:
         """Whether the bridge has restarted before the next packet.
 
         Then the time goes back in a HELLO, or together with the packet number, or by more than
-        slots can be late.
+        slots can be late; or it jumps forwards.
         """
         step = _signed(sequence - self.sequence, _SEQUENCES)
         elapsed_us = _signed(time_us - self.time_us, _TIMES)
         if elapsed_us < 0 and (hello or step < 0 or elapsed_us < -_LATE_US):
             return True
-        # After more than 36 minutes the time of a restarted bridge looks like one that has wrapped;
-        # but the first HELLO after a start has number 0, which is then out of sequence.
+        # After more than 36 minutes the time of a restarted bridge looks like one that has wrapped,
+        # mostly by far too much; and the first HELLO after a start has number 0, which is then out
+        # of sequence.
+        if elapsed_us > _SILENT_US:
+            return True
         return hello and sequence == 0 and step != 1 and time_us < self.time_us % _TIMES
 
     def follow(self, sequence: int, time_us: int) -> int | None:

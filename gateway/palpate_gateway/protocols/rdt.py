@@ -25,7 +25,8 @@ RECORD_BYTES = 36
 U32 = 1 << 32
 
 LATE_WINDOW = 128
-"""A record further behind than this is not late: the device has restarted [records]."""
+"""A record further behind than this is not late, if its number is one of the first of a start, no
+greater than this: the device has restarted [records]."""
 
 LATE_COUNTS = 8000
 """The same for the time of sampling: a second of the fastest counter [counts]."""
@@ -157,7 +158,8 @@ class RdtSequence:
         # device may send faster than it samples; but no record is before the first.
         sampled_before = 0 < sampled_behind <= LATE_COUNTS
         sampled_before |= sampled_behind == 0 and rdt_sequence != 1
-        if (in_order or behind <= LATE_WINDOW) and sampled_before:
+        window = LATE_COUNTS if rdt_sequence > LATE_WINDOW else LATE_WINDOW
+        if (in_order or behind <= window) and sampled_before:
             return self._drop("late_records")
         self.counters["restarts"] += 1
         lost = max(rdt_sequence - 1, 0)

@@ -151,9 +151,11 @@ class CounterClock:
         return counter / self._rate_hz
 
     def _check_restart(self, gained: int, waited_s: float) -> None:
-        went_on = gained >= 0
-        if self._rate_hz is not None:
-            went_on = went_on and abs(gained / self._rate_hz - waited_s) <= _RESTART_S
+        if self._rate_hz is None:
+            # After a restart far behind, the nearer way may be forwards: too far for the time.
+            went_on = 0 <= gained <= wire.LATE_COUNTS * (waited_s + _RESTART_S)
+        else:
+            went_on = gained >= 0 and abs(gained / self._rate_hz - waited_s) <= _RESTART_S
         if not went_on:
             raise DeviceLost(
                 f"{self._name}: its counter did not continue: it was restarted",
@@ -226,7 +228,7 @@ class WrenchRdt(WrenchDevice):
         self._decoder, self._sequence = RdtDecoder(), RdtSequence()
         self._early: list[_Record] = []
         self._number = 0
-        self._interrupted = False
+        self._interrupted_at: int | None = None
         self._heard_s = time.monotonic()
 
     def zero(self) -> None:
@@ -276,7 +278,7 @@ class WrenchRdt(WrenchDevice):
         self._start()
         first = self._early[0].raw.status
         self._number = wire.hex_sensor_number(first)
-        self._interrupted = False
+        self._interrupted_at = None
         self._is_chosen(first)
         return serial or self._port.name
 
@@ -315,7 +317,7 @@ class WrenchRdt(WrenchDevice):
 
     def _check_scale(self) -> None:
         """After an interruption: whoever caused it may have changed the device's settings."""
-        self._interrupted = False
+        self._interrupted_at = None
         if self._options.scale() or self._profile.scale:
             return
         try:
@@ -335,7 +337,7 @@ class WrenchRdt(WrenchDevice):
         for _ in range(_STARTS):
             self._port.write(wire.START_REQUEST)
             with contextlib.suppress(DeviceTimeout):
-                self._early = self._fresh(self._port.receive(self._patience_s))
+                self._take(self._port.receive(self._patience_s), self._early)
             if self._early:
                 return
         raise DeviceTimeout(
@@ -350,38 +352,43 @@ class WrenchRdt(WrenchDevice):
         self._port.close()
 
     def _receive(self, timeout_s: float) -> Sequence[WrenchReading]:
-        readings = []
         records = self._listen(timeout_s)
-        if self._interrupted:
+        return self._before_error(self._measured(record) for record in records)
+
+    def _measured(self, record: _Record) -> WrenchReading | None:
+        if self._interrupted_at is not None and record.tick >= self._interrupted_at:
             self._check_scale()
-        for record in records:
-            overload = self._overload(record.raw)
-            if overload is None:
-                continue
-            wrench = self._scale.wrench(record.raw.counts).tolist()
-            readings.append(
-                self._reading(
-                    wrench,
-                    time_s=record.time_s,
-                    arrival_ns=record.arrival_ns,
-                    tick=record.tick,
-                    overload=overload,
-                )
-            )
-        return [reading for reading in readings if reading is not None]
+        overload = self._overload(record.raw)
+        if overload is None:
+            return None
+        return self._reading(
+            self._scale.wrench(record.raw.counts).tolist(),
+            time_s=record.time_s,
+            arrival_ns=record.arrival_ns,
+            tick=record.tick,
+            overload=overload,
+        )
 
     def _listen(self, timeout_s: float) -> list[_Record]:
-        """New records; may be none, if the datagrams held none."""
+        """New records, those before an error first; may be none, if the datagrams held none."""
+        if self._held_error is not None:
+            raise self._held_error
         records, self._early = self._early, []
         until = time.monotonic() + timeout_s
         while not records:
             received = False
             left_s = max(until - time.monotonic(), 0.0)
-            with contextlib.suppress(DeviceTimeout):
-                records += self._fresh(self._port.receive(min(left_s, self._patience_s)))
+            try:
+                self._take(self._port.receive(min(left_s, self._patience_s)), records)
                 received = True
                 for _ in range(_AT_ONCE - 1):
-                    records += self._fresh(self._port.receive(0.0))
+                    self._take(self._port.receive(0.0), records)
+            except DeviceTimeout:
+                pass
+            except DeviceError as error:
+                if not records:
+                    raise
+                self._held_error = error
             self._keep_going()
             if received:
                 break
@@ -397,19 +404,18 @@ class WrenchRdt(WrenchDevice):
             self._counts["starts_repeated"] += 1
             self._port.write(wire.START_REQUEST)
 
-    def _fresh(self, datagram: ReceivedBytes) -> list[_Record]:
-        """Records of a datagram, without repeated and late ones."""
-        records = []
+    def _take(self, datagram: ReceivedBytes, records: list[_Record]) -> None:
+        """Add the records of a datagram, without repeated and late ones."""
         for raw in self._decoder.feed(datagram.data):
             self._heard_s = time.monotonic()
             step = self._sequence.step(raw.rdt_sequence, raw.ft_sequence)
-            self._interrupted |= step.new_epoch
+            if step.new_epoch and self._interrupted_at is None:
+                self._interrupted_at = step.tick
             if step.keep:
                 time_s = self._clock.follow(
                     raw.ft_sequence, 1e-9 * datagram.arrival_ns, new_epoch=step.new_epoch
                 )
                 records.append(_Record(raw, step.tick, time_s, datagram.arrival_ns))
-        return records
 
     def _overload(self, raw: RdtRecord) -> bool | None:
         """Whether the range is exceeded; None, and counted, if the record is not valid."""

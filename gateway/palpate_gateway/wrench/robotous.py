@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.clock.sample_times import ArrivalTimes
-from palpate_gateway.ports.can_bus import CanBus
+from palpate_gateway.ports.can_bus import CanBus, check_bitrate
 from palpate_gateway.ports.serial_port import SerialPort
 from palpate_gateway.protocols import robotous as wire
 from palpate_gateway.protocols.robotous import (
@@ -36,6 +36,10 @@ from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
 
 _APART = 0.75
 """Halves that are further apart belong to two samples [periods]."""
+
+_SCATTER_S = 2e-3
+"""But so far apart may be the stamps of two halves of one sample [s]: a stamp scatters by 0.9 ms
+(hardware reference 5.1), and a USB adapter delivers once a millisecond."""
 
 
 class RobotousSerialLine:
@@ -83,7 +87,7 @@ class RobotousCanLine:
         self.name = bus.name
         self._bus = bus
         self._request_id, self._ids = request_id, (first_id, second_id)
-        self._apart_ns = round(1e9 * _APART * period_s)
+        self._apart_ns = round(1e9 * max(_APART * period_s, _SCATTER_S))
         self._first_ns = 0
         self._decoder = RobotousCanDecoder(*self._ids)
 
@@ -142,7 +146,7 @@ class RobotousOptions(WrenchOptions):
         baud: Speed that is set in the sensor [bit/s].
         interface: python-can's name of the kind of bus, e.g. ``socketcan``.
         channel: Its name, e.g. ``can0``.
-        bitrate: Bit rate of the bus [bit/s]; 0 = leave its setting.
+        bitrate: Bit rate of the bus [bit/s]; 0 = leave its setting, as ``socketcan`` requires.
         bus_options: Further options of python-can; for ``udp_multicast`` also ``listen``, the
             address of the network that is joined: without it only this host is heard.
         request_id: CAN identifier of requests.
@@ -185,6 +189,7 @@ class RobotousOptions(WrenchOptions):
                 raise ValueError(f"rate_hz {self.rate_hz} is above {highest} for {self.baud} bit/s")
         else:
             RobotousCanDecoder(self.first_id, self.second_id)
+            check_bitrate(self.interface, self.bitrate)
         return self
 
 

@@ -152,7 +152,7 @@ def test_another_device_of_the_bus_is_not_taken_for_the_finger(
 
 
 def test_nobody_on_the_bus_is_told(finger: Any) -> None:
-    with pytest.raises(DeviceError, match="no slot within 2 s"):
+    with pytest.raises(DeviceError, match="no reading came within 2 s"):
         finger().open()
 
 

@@ -7,10 +7,12 @@ import socket
 import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple
+from unittest.mock import ANY
 
 import pytest
 
 from palpate.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
+from palpate_gateway.ports import can_bus
 from palpate_gateway.ports.can_bus import CanBus
 from palpate_gateway.ports.can_frames import BUS_OFF
 from palpate_gateway.ports.datagrams import BATCH
@@ -108,7 +110,7 @@ def test_what_is_no_data_frame_is_counted(sender: Any, bus: CanBus) -> None:
     sender.send(can.Message(is_error_frame=True))
     sender.send(can.Message(arbitration_id=5, data=b"\x01", is_extended_id=False))
     assert [m.can_id for m in read(bus, 1)] == [5]
-    assert bus.counters == {"error_frames": 1, "other_frames": 1}
+    assert bus.counters == {"error_frames": 1, "other_frames": 1, "bad_lines": 0}
 
 
 def test_only_noise_is_silence(sender: Any, bus: CanBus) -> None:
@@ -131,6 +133,25 @@ def test_bus_off_is_told_after_what_came_before_it(sender: Any, bus: CanBus) -> 
     assert [m.can_id for m in read(bus, 1)] == [6]
 
 
+@pytest.mark.parametrize(
+    ("interface", "remedy"),
+    [("socketcan", "restart-ms.*ip link set can3 down; ip link set can3 up"), ("slcan", "itself$")],
+)
+def test_bus_off_says_what_brings_it_back(
+    monkeypatch: pytest.MonkeyPatch, interface: str, remedy: str
+) -> None:
+    where = {"interface": "virtual", "channel": "off"}
+    monkeypatch.setattr(can_bus, "available", lambda: False)
+    monkeypatch.setattr(can_bus, "open_can", lambda _: can.Bus(**where))
+    bus = CanBus(interface, "can3")
+    bus.open()
+    with can.Bus(**where) as sender:
+        sender.send(can.Message(arbitration_id=BUS_OFF, is_error_frame=True, is_extended_id=False))
+        with pytest.raises(DeviceLost, match=f"bus off.*{remedy}"):
+            bus.read(1.0)
+    bus.close()
+
+
 def test_bus_off_by_the_state_of_the_interface(
     sender: Any, bus: CanBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -151,6 +172,42 @@ def test_a_bus_that_breaks_is_told(bus: CanBus, monkeypatch: pytest.MonkeyPatch)
         bus.write(1, b"")  # what is its own comes back
     with pytest.raises(DeviceLost, match="No such device"):
         bus.read(1.0)
+
+
+class DriverError(Exception):
+    """No error of python-can, nor of the system."""
+
+
+def test_whatever_a_driver_raises_loses_the_bus_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **more: object) -> None:
+        raise DriverError("library is unwell")
+
+    bus = CanBus("virtual", "whatever")
+    bus.open()
+    monkeypatch.setattr(type(bus._bus), "recv", broken)
+    monkeypatch.setattr(type(bus._bus), "send", broken)
+    with pytest.raises(DeviceLost, match="library is unwell"):
+        bus.read(0.1)
+    with pytest.raises(DeviceLost, match="library is unwell"):
+        bus.write(1, b"")
+    bus.close()
+    monkeypatch.setattr(can_bus, "open_can", broken)
+    with pytest.raises(DeviceError, match="cannot join the bus: library is unwell"):
+        bus.open()
+
+
+def test_a_damaged_line_of_a_serial_adapter_is_counted_and_reading_goes_on() -> None:
+    bus = CanBus("slcan", "loop://", options={"sleep_after_open": 0})
+    bus.open()
+    adapter = bus._bus.serialPortOrig
+    adapter.reset_input_buffer()
+    damaged = (b"t1\r", b"t12\r", b"T0000\r", b"t0G1101\r")
+    for line in damaged:
+        adapter.write(line)
+        adapter.write(b"t0051AB\r")
+        assert read(bus, 1) == [Message(5, b"\xab", ANY)]
+    bus.close()
+    assert bus.counters["bad_lines"] == len(damaged)
 
 
 def test_whatever_else_comes_over_the_network_is_counted(

@@ -17,7 +17,7 @@ from palpate.errors import DeviceError, DeviceLost, DeviceTimeout
 from palpate_gateway.ports.port import settle
 from palpate_gateway.ports.serial_port import SerialPort
 
-pytest.importorskip("serial")
+serial = pytest.importorskip("serial")
 
 
 class Plug:
@@ -117,6 +117,29 @@ def test_a_line_that_is_not_there_says_what_to_do(tmp_path: Path) -> None:
     port = SerialPort(str(tmp_path / "ttyUSB9"), 115200)
     with pytest.raises(DeviceError, match=r"ttyUSB9: cannot be opened.*-> plug it in"):
         port.open()
+
+
+def test_adapter_that_is_pulled_while_it_is_opened_is_told(
+    plug: Plug, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Then pyserial lets the system's own error through, which is no OSError.
+    monkeypatch.setattr(serial.Serial, "_update_dtr_state", lambda _: plug.pull())
+    with pytest.raises(DeviceError, match="cannot be opened"):
+        SerialPort(plug.name, 230400).open()
+
+
+def test_adapter_that_is_pulled_while_it_takes_nothing_is_told(
+    plug: Plug, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(_: object) -> None:
+        raise termios.error(5, "Input/output error")
+
+    monkeypatch.setattr(serial.Serial, "reset_output_buffer", gone)
+    with (
+        SerialPort(plug.name, 230400) as port,
+        pytest.raises(DeviceLost, match="is gone"),
+    ):
+        port.write(bytes(1 << 20))
 
 
 def test_a_line_is_for_one_program(plug: Plug) -> None:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import pytest
 
 from palpate.errors import DeviceError
 from palpate_gateway.emulators.rdt import WebPage
+from palpate_gateway.ports import sockets
 from palpate_gateway.ports.sockets import read_page
 
 
@@ -50,6 +53,18 @@ def test_no_page() -> None:
         read_page(url, timeout_s=10.0, most_bytes=10)
     with pytest.raises(DeviceError, match="unknown url type"):
         read_page("page", timeout_s=10.0, most_bytes=10)
+
+
+def test_a_page_is_not_read_beyond_its_time_though_bytes_wait(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seconds = itertools.count()
+    with served(bytes(1000)) as url:
+        monkeypatch.setattr(
+            sockets, "time", SimpleNamespace(monotonic=lambda: float(next(seconds)))
+        )
+        with pytest.raises(DeviceError, match=r"not read within 0\.5 s|timed out"):
+            read_page(url, timeout_s=0.5, most_bytes=1 << 20)
 
 
 @pytest.mark.parametrize(

@@ -48,11 +48,10 @@ def test_every_source_has_its_own_numbers() -> None:
 
 def test_device_time_is_unwrapped() -> None:
     decoder = BridgeDecoder()
-    times = [2**32 - 10_000, 0, 10_000, 2**31, 2**32 - 1, 3]
-    records = [r for n, t in enumerate(times) for r in decoder.feed(packet(n, t))]
-    assert [r.time_us for r in records] == [
-        2**32 - 10_000, 2**32, 2**32 + 10_000, 2**32 + 2**31, 2 * 2**32 - 1, 2 * 2**32 + 3,
-    ]  # fmt: skip
+    times = list(range(2**32 - 10_000, 2 * 2**32 + 20_000_000, 8_000_000))
+    data = b"".join(packet(n, t % 2**32) for n, t in enumerate(times))
+    records = decoder.feed(data)
+    assert [r.time_us for r in records] == times
     assert {r.epoch for r in records} == {0}
 
 
@@ -72,6 +71,8 @@ def test_slots_behind_a_hello_may_be_a_little_earlier() -> None:
         (packet(2, 9_000_000, SLOTS), packet(3, 40_000, SLOTS)),  # and the number goes on by chance
         (packet(500, 500_000, SLOTS), packet(501, 400_000, HELLO)),
         (packet(500, 3_000_000_000, SLOTS), packet(0, 1000, HELLO)),  # after 50 minutes
+        (packet(500, 3_000_000_000, SLOTS), packet(3, 40_000, SLOTS)),  # and its HELLO was lost
+        (packet(500, 4_200_000_000, SLOTS), packet(3, 40_000, SLOTS)),  # shortly before the wrap
     ],
 )
 def test_restarts_begin_an_epoch(before: bytes, after: bytes) -> None:

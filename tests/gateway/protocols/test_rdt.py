@@ -157,6 +157,14 @@ def test_loss_of_power_shows_by_the_counter_alone(before: tuple[int, int], after
     assert sequence.counters["restarts"] == 1
 
 
+@pytest.mark.parametrize("behind", [LATE_WINDOW + 1, 700])
+def test_record_that_is_late_by_both_numbers_is_no_restart(behind: int) -> None:
+    steps, sequence = follow((1000, 51_000), (1000 - behind, 51_000 - behind), (1001, 51_001))
+    assert [step.keep for step in steps] == [True, False, True]
+    assert sequence.counters["restarts"] == 0
+    assert sequence.counters["late_records"] == 1
+
+
 def test_sequence_wraps() -> None:
     steps, sequence = follow((U32 - 2, 1), (U32 - 1, 2), (0, 3), (U32 - 1, 2), (2, 5), (1, 4))
     assert [step.keep for step in steps] == [True, True, True, False, True, False]

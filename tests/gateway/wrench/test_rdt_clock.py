@@ -53,6 +53,14 @@ def test_a_pause_of_ours_is_none() -> None:
 def test_an_unknown_rate_tells_no_time() -> None:
     clock = CounterClock(None, "it")
     assert clock.follow(100, 0.0, new_epoch=True) is None
-    assert clock.follow(100_000, 1.0, new_epoch=True) is None
+    assert clock.follow(8_000, 1.0, new_epoch=True) is None
     with pytest.raises(DeviceLost, match="it was restarted"):
         clock.follow(5, 2.0, new_epoch=True)
+
+
+@pytest.mark.parametrize("before", [1_000_000_000, 3_000_000_000])
+def test_a_restart_is_found_wherever_a_counter_of_unknown_rate_was(before: int) -> None:
+    clock = CounterClock(None, "it")
+    clock.follow(before, 0.0, new_epoch=True)
+    with pytest.raises(DeviceLost, match="it was restarted"):
+        clock.follow(500, 1.5, new_epoch=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,7 +20,7 @@ from palpate_gateway.emulators.robotous import (
     RobotousSerialEmulator,
 )
 from palpate_gateway.readings import WrenchReading
-from palpate_gateway.wrench.robotous import RobotousOptions, WrenchRobotous
+from palpate_gateway.wrench.robotous import RobotousCanLine, RobotousOptions, WrenchRobotous
 
 pytest.importorskip("serial")
 can = pytest.importorskip("can")
@@ -215,6 +216,25 @@ def test_halves_far_apart_are_not_joined(
     follower.until(lambda: follower.counts()["lonely_second"])
     follower.more()
     assert all(map(is_of_sweep, follower.readings))
+
+
+@pytest.mark.parametrize(("apart_us", "joined"), [(2_000, True), (2_500, False)])
+def test_stamps_of_halves_may_scatter_at_1000_hz(apart_us: int, joined: bool) -> None:
+    halves = [(1, b"\x0b" + bytes(7), 10**9), (2, bytes(8), 10**9 + 1000 * apart_us)]
+    bus = SimpleNamespace(
+        name="a",
+        counters={},
+        read=lambda _: SimpleNamespace(messages=lambda: halves),
+    )
+    line = RobotousCanLine(
+        bus,  # type: ignore[arg-type]
+        request_id=0x64,
+        first_id=1,
+        second_id=2,
+        period_s=1e-3,
+    )
+    assert len(line.read(0.1)) == joined
+    assert line.counters["lonely_first"] == (not joined)
 
 
 def test_others_on_the_bus_do_not_hide_silence(request: pytest.FixtureRequest) -> None:
