@@ -270,6 +270,7 @@ class RosBag(FileDevice):
             start_wall_ns=origin_ns,
             sensor_type=kind,
             rate_hz=options.rate_hz,
+            unfilled=options.unfilled,
         )
 
     def _first(self, bag: RosBagFile, topic: str) -> tuple[RosHand, RosFinger]:

@@ -118,7 +118,9 @@ class Pipeline:
                 self._tares.attempt()
         if kind is not None and (self.condition is None or kind is not self._kind):
             rate_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
-            self.condition = Condition(kind.layout, rate_hz, self._limits, self._retare)
+            self.condition = Condition(
+                kind.layout, rate_hz, self._limits, self._retare, unfilled=identity.unfilled
+            )
         elif self.condition is not None:
             self.condition.begin(exchanged=exchanged)
         self._kind = kind

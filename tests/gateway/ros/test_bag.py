@@ -235,3 +235,9 @@ def test_bytes_flipped_anywhere_never_crash(tmp_path: Path) -> None:
         except (RecordingError, ConfigError):
             continue
         assert all(np.isfinite(one.time_s) for one in readings)
+
+
+def test_a_channel_that_the_driver_does_not_fill_is_told_to_the_gateway(tmp_path: Path) -> None:
+    options = {"path": make_bag(tmp_path / "a.bag", 3), "missing": ["tac", "pac"]}
+    with make_device("ros_bag", options) as device:
+        assert device.identity.unfilled == {"TAC", "PAC"}
