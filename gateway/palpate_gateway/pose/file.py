@@ -19,7 +19,7 @@ from palpate.errors import RecordingError, WireError
 from palpate.files.record import RecordItem, only_name, read_record
 from palpate.messages import RobotPoseFrame
 from palpate_gateway.clock.envelope import ClockEnvelope
-from palpate_gateway.device import DeviceIdentity, FileDevice
+from palpate_gateway.device import BusDevice, DeviceIdentity, FileDevice
 from palpate_gateway.pose.placement import Placement, PlacementOptions, within_reach
 from palpate_gateway.pose.table import PoseRow, PoseTable
 from palpate_gateway.pose.track import PoseTrack, PoseVerdict
@@ -95,13 +95,15 @@ class RecordedPoses:
         """
         run: _RunClock | None = None  # of this run of the program
         since_s = last_s = 0.0
-        first_log_ns = 0
+        first_log_ns = heard_ns = 0
         for item in self._items():
             try:
                 frame = ROBOT_POSE.codec.decode(item.payload)
             except WireError as error:  # the recorder keeps what breaks the contract
                 self._rejected[f"rejected_{error.reason}"] += 1
                 continue
+            if heard_ns and item.log_time_ns - heard_ns > 1e9 * BusDevice.gone_s:
+                self._track.forget()  # as live
             verdict = self._track.take(frame)
             if verdict is PoseVerdict.RESTARTED:
                 # Only the recorder's clock spans both runs; its times include the delay of the bus.
@@ -112,6 +114,7 @@ class RecordedPoses:
                 verdict = self._track.take(frame)
             if verdict is not PoseVerdict.NEW:
                 continue
+            heard_ns = item.log_time_ns
             if self.start_wall_ns is None:
                 self.start_wall_ns = frame.wall_ns or item.log_time_ns
                 first_log_ns = item.log_time_ns

@@ -86,6 +86,16 @@ def test_a_program_that_began_anew_goes_on_by_the_recorders_clock(tmp_path: Path
     np.testing.assert_allclose(times, 0.004 * np.arange(20), atol=1e-9)
 
 
+def test_a_second_program_that_has_ended_does_not_lock_the_first_one_out(tmp_path: Path) -> None:
+    frames = [fakes.frame(n, time_ns=1_000_000_000 * n) for n in range(1, 61)]
+    short = fakes.frame(1, run_id=8, time_ns=5)
+    path = write(tmp_path / "a.mcap", [*frames[:5], short, *frames[6:]], period_ns=1_000_000_000)
+    readings, counters, _ = drain(path)
+    assert counters["restarts"] == 2
+    assert counters["poses_of_old_runs"] == 30, "what it published while the other was in force"
+    assert fakes.numbers(readings)[-1] == 60
+
+
 def drifting(count: int, *, tells_wall: bool = False) -> list[RobotPoseFrame]:
     """Poses a quarter of a second apart, by a clock that runs 200 ppm too fast."""
     return [

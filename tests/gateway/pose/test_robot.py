@@ -168,6 +168,26 @@ def test_a_program_that_began_anew_is_another_device(
     assert device.counters["samples"] == 1
 
 
+def test_a_second_program_that_has_ended_does_not_lock_the_first_one_out(
+    device: BusDevice, told: Publisher[Any]
+) -> None:
+    told.put(fakes.frame(1))
+    told.put(fakes.frame(1, run_id=8, time_ns=5))
+    fakes.take(device, 1)
+    with pytest.raises(DeviceLost, match="restarted"):
+        device.read(PATIENCE_S)
+    for number in (2, 3):  # after the restart, and after the silence of the second program
+        device.close()
+        fakes.until(lambda: not told.matched())
+        device.open()
+        fakes.until(told.matched)
+        told.put(fakes.frame(number))
+        if number == 2:
+            with pytest.raises(DeviceTimeout):
+                device.read(0.2)
+    assert fakes.numbers(fakes.take(device, 1)) == [3]
+
+
 def test_without_a_router_it_is_lost(free_port: int) -> None:
     link = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port}",))
     device = device_of(link, timeout_s=0.2)
