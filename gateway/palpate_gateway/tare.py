@@ -250,7 +250,7 @@ class TareAttempts:
             if self._over or never:
                 raise DeviceError(
                     f"{sensor} cannot be tared: {self._over or never}",
-                    remedy="tare a live sensor, or ask for a known tare by its id",
+                    remedy="tare a live tactile sensor, or ask for a known tare by its id",
                 )
             self._requested.append(_AskedTare(collector, future, anyway))
         return future

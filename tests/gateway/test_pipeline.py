@@ -172,6 +172,14 @@ def test_no_tare_after_the_end() -> None:
         made.ask_tare(5)
 
 
+def test_a_sensor_without_electrodes_is_not_tared() -> None:
+    """Nobody waits for frames that cannot come."""
+    made = Pipeline(DeviceInfo("pose_zenoh", None, "test", 250.0, True, False, Origin.LIVE))
+    made.begin(DeviceIdentity("arm", 0.004), LiveClock())
+    with pytest.raises(DeviceError, match="arm cannot be tared: it has no electrodes"):
+        made.ask_tare(5)
+
+
 def test_rate_of_the_condition_is_that_of_the_slots() -> None:
     """44 slots at 4400 Hz are 100 frames a second."""
     made = pipeline(live=True)

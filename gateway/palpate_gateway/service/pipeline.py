@@ -153,12 +153,16 @@ class Pipeline:
         Raises:
             DeviceError: No further frames will come to be averaged.
         """
-        is_record = self._info.driver == "record"
+        never = ""
+        if self._info.sensor_type is None:
+            never = "it has no electrodes"
+        elif self._info.driver == "record":
+            never = "it is a record, which brings its own tares"
         return self._tares.ask(
             frames,
             anyway=anyway,
             sensor=self._serial or "the sensor",
-            never="it is a record, which brings its own tares" if is_record else "",
+            never=never,
         )
 
     def give_up(self, why: str) -> None:
