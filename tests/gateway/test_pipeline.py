@@ -189,6 +189,16 @@ def test_rate_of_the_condition_is_that_of_the_slots() -> None:
     assert ends == list(range(20, 201, 20)), "blocks of 0.2 s"
 
 
+def test_rate_of_the_condition_is_that_of_a_driver_that_leaves_frames_out() -> None:
+    """A hand at 20 Hz: else a stuck electrode would be told five times as late."""
+    made = Pipeline(info(live=True))
+    made.begin(replace(IDENTITY, rate_hz=20.0), LiveClock())
+    others = frames(pushed(pipeline(live=True), readings(60), 10**9))
+    assert made.condition is not None
+    ends = [k for k, frame in enumerate(others, start=1) if made.condition.add(frame)]
+    assert ends == list(range(10, 61, 10)), "blocks of ten frames, the least"
+
+
 def test_paced_items_are_due_at_their_stamp() -> None:
     made = Pipeline(info(live=False), tare_frames=10)
     made.begin(IDENTITY, PacedClock())

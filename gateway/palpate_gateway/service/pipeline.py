@@ -117,7 +117,7 @@ class Pipeline:
             if self._tares_itself:
                 self._tares.attempt()
         if kind is not None and (self.condition is None or kind is not self._kind):
-            rate_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
+            rate_hz = identity.rate_hz or 1.0 / (identity.slot_period_s * kind.layout.slots)
             self.condition = Condition(
                 kind.layout, rate_hz, self._limits, self._retare, unfilled=identity.unfilled
             )
