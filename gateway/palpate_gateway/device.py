@@ -71,6 +71,8 @@ class DeviceIdentity:
             without a pause.
         has_clock: The device has a clock of its own, and its readings carry that time; False = a
             live device without one: times are the host's monotonic times of arrival.
+        unfilled: Those of the channels ``PDC``, ``PAC``, ``TAC`` and ``TDC`` that its driver never
+            fills: that they are invalid is no fault.
     """
 
     serial: str
@@ -79,6 +81,7 @@ class DeviceIdentity:
     sensor_type: SensorType | None = None
     rate_hz: float | None = None
     has_clock: bool = True
+    unfilled: frozenset[str] = frozenset()
 
 
 SERIAL_MAX = 64

@@ -79,7 +79,8 @@ def find_driver(name: str) -> type[Device]:
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
-        if error.name is None or module_name.startswith(error.name):
+        # The module itself, or a package that it is in: else it is one that it imports.
+        if error.name is None or f"{module_name}.".startswith(f"{error.name}."):
             raise ConfigError(
                 f"driver {name!r} names the module {module_name!r}, which does not exist",
                 remedy="reinstall the distribution that provides this driver",

@@ -30,7 +30,10 @@ _STILL = StillLimits()
 
 
 class TareCollector:
-    """Averages consecutive good frames: every channel is valid, of PAC at least one sample."""
+    """Averages consecutive good frames: all electrodes and PDC are valid.
+
+    PAC, TAC and TDC are averaged over their valid samples; 0 = there was none.
+    """
 
     def __init__(self, frames: int, limits: StillLimits = _STILL) -> None:
         self._wanted = frames
@@ -42,14 +45,13 @@ class TareCollector:
         """Take one frame; return the tare when there are enough.
 
         Raises:
-            DeviceError: A channel stays invalid, or something moves; names it. The next frame
-                starts a new average.
+            DeviceError: An electrode or PDC stays invalid, or something moves; names it. The next
+                frame starts a new average.
         """
-        missing = _missing(frame)
-        if missing:
+        if not _is_valid(frame, frame.sensor_type.layout.pdc_bit) or not frame.electrodes_valid:
             self._refused += 1
             if self._refused >= self._wanted:
-                raise self._invalid(frame, missing)
+                raise self._invalid(frame)
             return None
         if self._window and self._window[-1].sensor_type is not frame.sensor_type:
             self._window.clear()  # the finger was exchanged
@@ -65,7 +67,7 @@ class TareCollector:
         electrodes = np.array([frame.electrodes for frame in window], np.float64)
         pdc = np.array([frame.pdc for frame in window], np.float64)
         pac = np.concatenate([_valid_pac(frame) for frame in window]).astype(np.float64)
-        last = window[-1]
+        last, layout = window[-1], window[-1].sensor_type.layout
         # Judged as one window, not frame by frame: a slow shift shows only between its halves.
         motion = evidence_of(electrodes, pac, pdc).motion(self._limits)
         if motion:
@@ -81,13 +83,16 @@ class TareCollector:
             electrodes=baseline,
             electrodes_sd=electrodes.std(axis=0).astype(np.float32),
             pdc=float(pdc.mean()),
-            pac=float(pac.mean()),
-            tac=float(np.mean([frame.tac for frame in window])),
-            tdc=float(np.mean([frame.tdc for frame in window])),
+            pac=float(pac.mean()) if pac.size else 0.0,
+            tac=_mean([one.tac for one in window if _is_valid(one, layout.tac_bit)]),
+            tdc=_mean([one.tdc for one in window if _is_valid(one, layout.tdc_bit)]),
             frames_averaged=len(window),
         )
 
-    def _invalid(self, frame: ElectrodeFrame, channels: list[str]) -> DeviceError:
+    def _invalid(self, frame: ElectrodeFrame) -> DeviceError:
+        layout = frame.sensor_type.layout
+        needed = range(layout.pdc_bit + 1)
+        channels = [layout.bit_name(bit) for bit in needed if not _is_valid(frame, bit)]
         refused, self._refused = self._refused, 0
         self._window.clear()
         return DeviceError(
@@ -97,14 +102,12 @@ class TareCollector:
         )
 
 
-def _missing(frame: ElectrodeFrame) -> list[str]:
-    """Channels that a tare needs and that are invalid in this frame."""
-    layout = frame.sensor_type.layout
-    slow = (1 << layout.first_pac_bit) - 1
-    bad = ~frame.validity & slow
-    if not bad:
-        return [] if frame.validity >> layout.first_pac_bit else ["PAC"]
-    return [layout.bit_name(bit) for bit in range(layout.first_pac_bit) if bad >> bit & 1]
+def _is_valid(frame: ElectrodeFrame, bit: int) -> bool:
+    return bool(frame.validity >> bit & 1)
+
+
+def _mean(counts: list[int]) -> float:
+    return sum(counts) / max(len(counts), 1)
 
 
 def _valid_pac(frame: ElectrodeFrame) -> CountArray:
@@ -247,7 +250,7 @@ class TareAttempts:
             if self._over or never:
                 raise DeviceError(
                     f"{sensor} cannot be tared: {self._over or never}",
-                    remedy="tare a live sensor, or ask for a known tare by its id",
+                    remedy="tare a live tactile sensor, or ask for a known tare by its id",
                 )
             self._requested.append(_AskedTare(collector, future, anyway))
         return future

@@ -83,13 +83,14 @@ def test_broken_table_entry(
         drivers.load_driver("broken")
 
 
+@pytest.mark.parametrize("package", ["package_that_is_not_there", "driver_that"])
 def test_missing_extra_gives_the_install_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, package: str
 ) -> None:
-    (tmp_path / "driver_that_needs_more.py").write_text("import package_that_is_not_there\n")
+    (tmp_path / "driver_that_needs_more.py").write_text(f"import {package}\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setitem(drivers.DRIVERS, "more", "driver_that_needs_more:X")
-    with pytest.raises(MissingExtraError, match=r"package_that_is_not_there.*palpate\[gateway\]"):
+    with pytest.raises(MissingExtraError, match=rf"{package}.*palpate\[gateway\]"):
         drivers.load_driver("more")
 
 

@@ -172,6 +172,14 @@ def test_no_tare_after_the_end() -> None:
         made.ask_tare(5)
 
 
+def test_a_sensor_without_electrodes_is_not_tared() -> None:
+    """Nobody waits for frames that cannot come."""
+    made = Pipeline(DeviceInfo("pose_zenoh", None, "test", 250.0, True, False, Origin.LIVE))
+    made.begin(DeviceIdentity("arm", 0.004), LiveClock())
+    with pytest.raises(DeviceError, match="arm cannot be tared: it has no electrodes"):
+        made.ask_tare(5)
+
+
 def test_rate_of_the_condition_is_that_of_the_slots() -> None:
     """44 slots at 4400 Hz are 100 frames a second."""
     made = pipeline(live=True)
@@ -179,6 +187,16 @@ def test_rate_of_the_condition_is_that_of_the_slots() -> None:
     assert made.condition is not None
     ends = [k for k, frame in enumerate(others, start=1) if made.condition.add(frame)]
     assert ends == list(range(20, 201, 20)), "blocks of 0.2 s"
+
+
+def test_rate_of_the_condition_is_that_of_a_driver_that_leaves_frames_out() -> None:
+    """A hand at 20 Hz: else a stuck electrode would be told five times as late."""
+    made = Pipeline(info(live=True))
+    made.begin(replace(IDENTITY, rate_hz=20.0), LiveClock())
+    others = frames(pushed(pipeline(live=True), readings(60), 10**9))
+    assert made.condition is not None
+    ends = [k for k, frame in enumerate(others, start=1) if made.condition.add(frame)]
+    assert ends == list(range(10, 61, 10)), "blocks of ten frames, the least"
 
 
 def test_paced_items_are_due_at_their_stamp() -> None:

@@ -66,10 +66,10 @@ def test_bad_frames_are_left_out() -> None:
 
 def test_invalid_channel_is_named() -> None:
     collector = TareCollector(5)
-    bad = frame(1, validity=ALL_VALID & ~(1 << 6) & ~(1 << BIOTAC_LAYOUT.tdc_bit))
+    bad = frame(1, validity=ALL_VALID & ~(1 << 6) & ~(1 << BIOTAC_LAYOUT.pdc_bit))
     for _ in range(4):
         assert collector.add(bad) is None
-    with pytest.raises(DeviceError, match=r"cannot tare BT1: E7, TDC invalid \(5 frames refused\)"):
+    with pytest.raises(DeviceError, match=r"cannot tare BT1: E7, PDC invalid \(5 frames refused\)"):
         collector.add(bad)
 
 

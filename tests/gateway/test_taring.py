@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -221,13 +222,50 @@ def test_a_sensor_with_one_sample_of_pac_a_frame_can_be_tared() -> None:
     assert tare.pac == pytest.approx(2040.0, abs=2.0)
 
 
-def test_a_sensor_without_pac_cannot() -> None:
+def bits_of(channel: str) -> int:
+    layout = fakes.LAYOUT
+    pac = layout.all_valid >> layout.first_pac_bit << layout.first_pac_bit
+    return {"PAC": pac, "TAC": 1 << layout.tac_bit, "TDC": 1 << layout.tdc_bit}[channel]
+
+
+@pytest.mark.parametrize("channel", ["PAC", "TAC", "TDC"])
+def test_a_channel_that_the_driver_never_fills_is_no_fault_and_no_hindrance(channel: str) -> None:
+    """As a driver of ROS that was written for the electrodes."""
+    info = DeviceInfo("test", SensorType.BIOTAC, "test", 100.0, True, False, Origin.LIVE)
+    made, finger = Pipeline(info, tare="query"), fakes.Finger()
+    made.begin(replace(IDENTITY, unfilled=frozenset({channel})), LiveClock())
+    finger.invalid = bits_of(channel)
+    asked = made.ask_tare(0)
+    push(made, finger.frames(3.0))
+    tare = asked.result(timeout=0)
+    unknown = {name for name in ("pdc", "pac", "tac", "tdc") if getattr(tare, name) == 0.0}
+    assert unknown == {channel.lower()}
+    assert made.condition is not None
+    assert made.condition.faults == ()
+
+
+def test_a_sensor_without_pdc_cannot_be_tared() -> None:
     finger, collector = fakes.Finger(), TareCollector(5)
-    finger.invalid = fakes.LAYOUT.all_valid >> 22 << 22
+    finger.invalid = 1 << fakes.LAYOUT.pdc_bit
     for _ in range(4):
         assert collector.add(finger.frame()) is None
-    with pytest.raises(DeviceError, match="cannot tare BT1: PAC invalid"):
+    with pytest.raises(DeviceError, match="cannot tare BT1: PDC invalid"):
         collector.add(finger.frame())
+
+
+def test_a_tare_leaves_out_invalid_samples() -> None:
+    finger, collector = fakes.Finger(), TareCollector(10)
+    made = []
+    for k in range(10):
+        frame = finger.frame()
+        if k % 2:  # what a parity error leaves
+            valid = frame.validity & ~bits_of("TAC") & ~bits_of("TDC")
+            frame = replace(frame, tac=4095, tdc=0, validity=valid)
+        else:
+            good = frame
+        made.append(collector.add(frame))
+    assert made[-1] is not None
+    assert (made[-1].tac, made[-1].tdc) == pytest.approx((good.tac, good.tdc), abs=5.0)
 
 
 def test_a_biotac_sp_is_tared_by_its_24_electrodes() -> None:

@@ -168,6 +168,8 @@ def test_a_tare_of_another_temperature_is_doubtful(
     bit = SensorType.BIOTAC.layout.tdc_bit
     deaf = dataclasses.replace(further, validity=further.validity & ~(1 << bit))
     assert _flags(deaf, tare, runtime) == ()
+    # Nor does a tare without any valid TDC.
+    assert _flags(further, dataclasses.replace(tare, tdc=0.0), runtime) == ()
 
 
 def test_the_tare_of_another_finger_is_none(

@@ -122,7 +122,7 @@ _NO_REASONS = frozenset(
 )
 """Counters of the features service that do not stand for a published frame without estimate."""
 
-_DROPPED = ("late_messages", "late_wrenches", "rejected_messages")
+_DROPPED = ("late_messages", "late_wrenches", "early_messages", "rejected_messages")
 
 
 def total(counters: dict[str, int], name: str) -> int:

@@ -15,7 +15,7 @@ None of the real recordings raises a false alarm: docs/tare-and-health.md.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -57,10 +57,15 @@ _Flags = npt.NDArray[np.bool_]
 
 
 class ChannelHealth:
-    """Finds the faulty channels of one sensor."""
+    """Finds the faulty channels of one sensor.
 
-    def __init__(self, electrodes: int) -> None:
-        self._electrodes = electrodes
+    Args:
+        electrodes: Their number.
+        unfilled: Channels other than electrodes that are never valid, which is no fault.
+    """
+
+    def __init__(self, electrodes: int, unfilled: Collection[str] = ()) -> None:
+        self._electrodes, self._unfilled = electrodes, frozenset(unfilled)
         self._stuck: dict[int, int] = {}  # electrode, from 0, to the value that it keeps
         self._names: dict[FaultKind, tuple[str, ...]] = {}
         self.usable: _Flags = np.ones(electrodes, np.bool_)
@@ -143,6 +148,7 @@ class ChannelHealth:
             dead = dead | (np.add.reduce([block.seen for block in self._recent]) < few)
         slow = [sum(seen) for seen in zip(*(b.slow_seen for b in self._recent), strict=True)]
         silent = [name for name, seen in zip(_SLOW, slow, strict=True) if seen < few]
+        silent = [name for name in silent if name not in self._unfilled]
         if silent:
             names[FaultKind.DEAD] = silent
         return dead
@@ -172,7 +178,7 @@ class ChannelHealth:
             kind = FaultKind.SATURATED
         elif len(self._recent) == WINDOW_BLOCKS:
             if not any(one.pac_seen for one in self._recent):
-                kind = FaultKind.DEAD
+                kind = None if "PAC" in self._unfilled else FaultKind.DEAD
             elif self._pac_standing >= WINDOW_BLOCKS and all(b.pac_seen for b in self._recent):
                 kind = FaultKind.STUCK
         if kind is not None:

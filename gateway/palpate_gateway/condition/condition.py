@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import Enum
 
@@ -219,6 +220,7 @@ class Condition:
         rate_hz: Frames per second.
         limits: Noise up to which the sensor counts as still.
         retare: When to tare again without a request; None = never.
+        unfilled: Channels other than electrodes that its driver never fills.
     """
 
     def __init__(
@@ -227,12 +229,14 @@ class Condition:
         rate_hz: float,
         limits: StillLimits,
         retare: RetareRules | None = None,
+        *,
+        unfilled: Collection[str] = (),
     ) -> None:
         self._limits, self._retare = limits, retare
         self._blocks = FrameBlocks(layout, rate_hz)
         self._recent: deque[FrameBlock] = deque(maxlen=WINDOW_BLOCKS)
         self.level = UntouchedLevel()
-        self.channels = ChannelHealth(layout.electrodes)
+        self.channels = ChannelHealth(layout.electrodes, unfilled)
         self.warm_up = WarmUp()
         self._untouched_since_s: float | None = None
         self._now_s = 0.0

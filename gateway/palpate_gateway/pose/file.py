@@ -17,11 +17,43 @@ from palpate.bus.topics import POSE, ROBOT_POSE
 from palpate.config import Name
 from palpate.errors import RecordingError, WireError
 from palpate.files.record import RecordItem, only_name, read_record
-from palpate_gateway.device import DeviceIdentity, FileDevice
+from palpate.messages import RobotPoseFrame
+from palpate_gateway.clock.envelope import ClockEnvelope
+from palpate_gateway.device import BusDevice, DeviceIdentity, FileDevice
 from palpate_gateway.pose.placement import Placement, PlacementOptions, within_reach
 from palpate_gateway.pose.table import PoseRow, PoseTable
 from palpate_gateway.pose.track import PoseTrack, PoseVerdict
 from palpate_gateway.readings import PoseReading
+
+_SET_NS = 5e8
+"""A line of delays that jumps by more is of a wall clock that was set [ns]."""
+
+
+class _RunClock:
+    """The clock of one run of a robot's program, without its drift from the recorded wall clock.
+
+    Args:
+        first: The first pose of the run.
+        log_ns: When the recorder received it [ns since the Unix epoch].
+    """
+
+    def __init__(self, first: RobotPoseFrame, log_ns: int) -> None:
+        self._time_ns, self._wall_ns = first.time_ns, first.wall_ns or log_ns
+        self._tells_wall = first.wall_ns > 0
+        self._envelope = ClockEnvelope()
+        self._line_ns = self._set_ns = 0.0
+
+    def elapsed_s(self, frame: RobotPoseFrame, log_ns: int) -> float:
+        """Time of the next pose since the first [s]."""
+        robot_ns = frame.time_ns - self._time_ns
+        wall_ns = frame.wall_ns if self._tells_wall else log_ns
+        if wall_ns:
+            self._envelope.add(robot_ns * 1e-9, wall_ns - self._wall_ns - robot_ns)
+        line_ns = self._envelope.at(robot_ns * 1e-9)
+        if abs(line_ns - self._line_ns) > _SET_NS:
+            self._set_ns += line_ns - self._line_ns
+        self._line_ns = line_ns
+        return (robot_ns + line_ns - self._set_ns) * 1e-9
 
 
 class RecordedPoses:
@@ -61,31 +93,34 @@ class RecordedPoses:
         Raises:
             RecordingError: The record is damaged, or has no pose of this robot.
         """
-        began_ns: int | None = None  # first time of this run of the program, by its own clock
+        run: _RunClock | None = None  # of this run of the program
         since_s = last_s = 0.0
-        first_log_ns = 0
+        first_log_ns = heard_ns = 0
         for item in self._items():
             try:
                 frame = ROBOT_POSE.codec.decode(item.payload)
             except WireError as error:  # the recorder keeps what breaks the contract
                 self._rejected[f"rejected_{error.reason}"] += 1
                 continue
+            if heard_ns and item.log_time_ns - heard_ns > 1e9 * BusDevice.gone_s:
+                self._track.forget()  # as live
             verdict = self._track.take(frame)
             if verdict is PoseVerdict.RESTARTED:
                 # Only the recorder's clock spans both runs; its times include the delay of the bus.
                 self._restarts += 1
                 since_s = max((item.log_time_ns - first_log_ns) * 1e-9, last_s)
-                began_ns = None
+                run = None
                 self._track.restart()
                 verdict = self._track.take(frame)
             if verdict is not PoseVerdict.NEW:
                 continue
+            heard_ns = item.log_time_ns
             if self.start_wall_ns is None:
                 self.start_wall_ns = frame.wall_ns or item.log_time_ns
                 first_log_ns = item.log_time_ns
-            if began_ns is None:
-                began_ns = frame.time_ns
-            last_s = since_s + (frame.time_ns - began_ns) * 1e-9
+            if run is None:
+                run = _RunClock(frame, item.log_time_ns)
+            last_s = max(last_s, since_s + run.elapsed_s(frame, item.log_time_ns))
             yield PoseRow(frame.sequence, last_s, frame.pose_base_flange, self._track.missed_before)
         if self.start_wall_ns is None:
             raise self._no_poses()

@@ -78,15 +78,17 @@ class PoseZenoh(BusDevice):
         self._station = options.station or station
 
     def _open(self) -> DeviceIdentity:
+        if not self._restarted:  # but after a silence, e.g. of a second program that has ended
+            self._track.forget()
         self._track.begin()
         self._counts = dict.fromkeys(self._counts, 0)
         self._last_counts = {}
         self._began_ns = None
-        self._restarted = False
         try:
             self._session = Session.open(self._link, station=self._station)
         except LinkError as error:
             raise DeviceLost(error.problem, remedy=error.remedy) from error
+        self._restarted = False
         self._subscriber = self._session.subscriber(
             ROBOT_POSE, sensor=self._options.robot, delivery=Delivery.QUEUE
         )
@@ -126,6 +128,8 @@ class PoseZenoh(BusDevice):
                     remedy="check that its program runs, and its name, station and router: "
                     "palpate topic list",
                 ) from error
+            except LinkError as error:
+                raise DeviceLost(error.problem, remedy=error.remedy) from error
             reading = self._reading(received)
             if reading is not None:
                 count += 1

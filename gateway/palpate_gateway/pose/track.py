@@ -52,6 +52,10 @@ class PoseTrack:
         self._suspect: RobotPoseFrame | None = None
         self._suspects = 0
 
+    def forget(self) -> None:
+        """The program that had replaced others is gone: poses of theirs count again."""
+        self._old_runs.clear()
+
     def take(self, frame: RobotPoseFrame) -> PoseVerdict:
         """Judge the next pose; after RESTARTED comes ``begin`` or ``restart``."""
         if frame.run_id in self._old_runs:

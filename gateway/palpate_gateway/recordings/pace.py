@@ -13,6 +13,10 @@ _PACED = frozenset(topic.name for topic in (ELECTRODES, WRENCH, POSE, FIELD_TRUT
 """Topics that come as they are stamped; a tare may be much older than the record."""
 
 
+_SWAPPED_NS = 100_000_000
+"""A stamp that is earlier than one before it by no more is of a message that came late [ns]."""
+
+
 class RecordPace:
     """Times of one sensor's messages, by the monotonic clocks that stamped them.
 
@@ -49,11 +53,13 @@ class RecordPace:
         """
         if (stamp := _stamp_of(item)) is not None:
             stream = item.key, stamp.clock_id
-            played_again = stamp.monotonic_ns < self._last_ns.get(stream, 0)
+            last_ns = self._last_ns.get(stream, 0)
+            played_again = stamp.monotonic_ns < last_ns - _SWAPPED_NS
             if played_again or stamp.clock_id not in self._zeros_ns:  # how much later: the log's
                 self._now_ns += max(0, item.log_time_ns - self._log_ns)
                 self._zeros_ns[stamp.clock_id] = self._now_ns - stamp.monotonic_ns
-            self._last_ns[stream] = stamp.monotonic_ns
+            now_ns = stamp.monotonic_ns
+            self._last_ns[stream] = now_ns if played_again else max(last_ns, now_ns)
             here_ns = self._zeros_ns[stamp.clock_id] + stamp.monotonic_ns
             self._now_ns, self._log_ns = max(self._now_ns, here_ns), item.log_time_ns
         return self._now_ns

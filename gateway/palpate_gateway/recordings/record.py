@@ -95,9 +95,12 @@ class RecordReplay(FileDevice):
 
     def _no_frames(self) -> RecordingError:
         of_whom = f" of sensor {self._sensor!r}" if self._sensor else ""
+        tactile = [one for one in recorded_sensors(self._options.path) if one != self._sensor]
         return RecordingError(
             f"{self._options.path} holds no electrode frames{of_whom}",
-            remedy="record with the gateway running, or name a sensor that is in the record",
+            remedy=f"name a tactile sensor of the record: {', '.join(tactile)}"
+            if tactile
+            else "record while the gateway reads a tactile sensor",
         )
 
 

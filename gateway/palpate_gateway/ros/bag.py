@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
+import logging
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 from dataclasses import replace
 from itertools import islice
@@ -24,6 +25,8 @@ from palpate_gateway.readings import ElectrodeReading, WrenchReading
 from palpate_gateway.ros.biotac import RosFingerOptions
 from palpate_gateway.ros.wrench import RosWrenchMessage, decode_wrench
 from palpate_gateway.wrench.device import Mount, MountOptions, is_measured
+
+_log = logging.getLogger(__name__)
 
 _TACTILE = (BIOTAC_ALL, BIOTAC_HAND)
 
@@ -80,29 +83,40 @@ def _onward(
 ) -> Iterator[_Timed[_Decoded]]:
     """Messages whose times go on where their clock was set back for good.
 
-    That is counted in ``time_jumps``. A few earlier ones among later ones stay as they are.
+    That is counted in ``time_jumps``. One message that was stamped ahead of many is no such clock:
+    it is left out, and counted in ``early_messages``. A few earlier ones among later ones stay as
+    they are.
     """
     shift_ns = 0
-    last: _Timed[_Decoded] | None = None
+    before: _Timed[_Decoded] | None = None
+    last: _Timed[_Decoded] | None = None  # held back until the next one shows that it is right
     earlier: list[_Timed[_Decoded]] = []
     for told in messages:
         one = told._replace(time_ns=told.time_ns + shift_ns)
-        if last is not None and one.time_ns < last.time_ns:
-            earlier.append(one)
-            if len(earlier) < _BEGAN_ANEW:
-                continue
+        if last is None or one.time_ns >= last.time_ns:
+            if last is not None:
+                yield last
+            yield from earlier
+            before, last, earlier = last, one, []
+            continue
+        earlier.append(one)
+        if len(earlier) < _BEGAN_ANEW:
+            continue
+        if before is not None and earlier[0].time_ns > before.time_ns:
+            counts["early_messages"] += 1
+        else:
             counts["time_jumps"] += 1
+            yield last
             # Only the recorder's clock spans both, also for the other topics of the bag.
             gained_ns = max(earlier[0].recorded_ns - last.recorded_ns, 1)
             back_ns = last.time_ns + gained_ns - earlier[0].time_ns
             shift_ns += back_ns
             earlier = [each._replace(time_ns=each.time_ns + back_ns) for each in earlier]
-            one = max(earlier, key=lambda each: each.time_ns)
-            yield from earlier
-        else:
-            yield from earlier
-            yield one
-        last, earlier = one, []
+        *others, last = sorted(earlier, key=lambda each: each.time_ns)
+        yield from others
+        before, earlier = others[-1], []
+    if last is not None:
+        yield last
     yield from earlier
 
 
@@ -234,9 +248,10 @@ class RosBag(FileDevice):
         self._options = options
         self._mount = Mount(options.mount)
         self._track = options.track("")
+        self._told = False
         self._counts = dict.fromkeys(
             ("wrenches", "not_finite", "rejected_messages", "repeated_wrenches", "late_wrenches",
-             "time_jumps"), 0,
+             "time_jumps", "early_messages"), 0,
         )  # fmt: skip
 
     @property
@@ -255,6 +270,7 @@ class RosBag(FileDevice):
         origin_ns = self._origin_ns(bag)
         self._track.begin(origin_ns)
         self._counts = dict.fromkeys(self._counts, 0)
+        self._told = False
         streams: list[Iterator[ElectrodeReading | WrenchReading]] = [self._fingers(bag, topic)]
         if wrench:
             streams.append(self._wrenches(bag, wrench, origin_ns))
@@ -270,6 +286,7 @@ class RosBag(FileDevice):
             start_wall_ns=origin_ns,
             sensor_type=kind,
             rate_hz=options.rate_hz,
+            unfilled=options.unfilled,
         )
 
     def _first(self, bag: RosBagFile, topic: str) -> tuple[RosHand, RosFinger]:
@@ -318,12 +335,27 @@ class RosBag(FileDevice):
         for hand, time_ns, _ in _onward(self._hands(bag, topic), self._counts):
             # The header of ROS 1 has a number; drivers that do not fill it leave it at 0.
             now, lost = hand.sequence, None
-            if before is not None and now is not None and now > before:
-                lost = now - before - 1
+            if before is not None and now is not None:
+                if now > before:
+                    lost = now - before - 1
+                elif before > now > 1:  # no restart of the driver, which counts from 0 or 1
+                    self._disordered(bag, topic)
             before = now
             reading = self._track.take(replace(hand, time_ns=time_ns), lost=lost)
             if reading is not None:
                 yield reading
+
+    def _disordered(self, bag: RosBagFile, topic: str) -> None:
+        """The numbers of a topic go back: its messages are sorted by a clock that was set back."""
+        if not self._told:
+            _log.warning(
+                "%s: messages of %s are not in the order in which they were sent: the clock of its "
+                "recorder was set back, or several programs published them; do not use this part",
+                bag.path,
+                topic,
+            )
+        self._told = True
+        self._counts["time_jumps"] += 1
 
     def _stamped(self, bag: RosBagFile, topic: str) -> Iterator[_Timed[RosWrenchMessage]]:
         for payload, recorded_ns in bag.messages(topic):

@@ -43,7 +43,8 @@ class RosFingerOptions(StrictConfig):
         serial: Serial number of the finger. In a ``BioTacHand`` it finds the finger; a
             ``BiotacAll`` has none, so that it is only published. Empty = by its place.
         rate_hz: New readings each second [Hz].
-        missing: Channels that this driver does not fill; their validity bits stay clear.
+        missing: Channels that this driver does not fill; their validity bits stay clear, which is
+            no fault.
         repeats: What to do with a ``BiotacAll`` that has no new count of electrodes, PDC, TAC and
             TDC: the rate of messages is the controller's, not the finger's.
     """
@@ -53,6 +54,11 @@ class RosFingerOptions(StrictConfig):
     rate_hz: float = Field(default=100.0, gt=0.0, le=10_000.0)
     missing: tuple[Channel, ...] = ()
     repeats: Literal["drop", "keep"] = "drop"
+
+    @property
+    def unfilled(self) -> frozenset[str]:
+        """The same channels by their names in ``DeviceIdentity``."""
+        return frozenset(channel.upper() for channel in self.missing)
 
     def track(self, layout: str) -> FingerTrack:
         """The track of the finger in messages of a layout."""
@@ -136,7 +142,13 @@ class RosBiotac(RosDevice):
         self._kind = kind
         # Its driver may publish fewer frames than slots would make.
         rate_hz = self._options.rate_hz
-        return DeviceIdentity(serial, period_s, sensor_type=kind, rate_hz=rate_hz)
+        return DeviceIdentity(
+            serial,
+            period_s,
+            sensor_type=kind,
+            rate_hz=rate_hz,
+            unfilled=self._options.unfilled,
+        )
 
     def _close(self) -> None:
         self._topic.close()

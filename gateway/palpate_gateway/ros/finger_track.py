@@ -76,7 +76,7 @@ class FingerTrack:
         self._last_ns: int | None = None
         self._late = 0
         self._heard_s: float | None = None
-        self._tick = 0
+        self._tick = self._gap = 0
         self._slow: tuple[int, ...] = ()
 
     def find(self, hand: RosHand) -> RosFinger | None:
@@ -102,7 +102,8 @@ class FingerTrack:
         if self._origin_ns is None:
             self._origin_ns = hand.time_ns
         time_s = (hand.time_ns - self._origin_ns) * 1e-9
-        missed = self._missed(time_s, lost)
+        # Also of the messages before this one that had no new reading of the finger.
+        self._gap += self._missed(time_s, lost)
         self._heard_s = time_s
         finger = self.find(hand)
         if finger is None:
@@ -112,6 +113,7 @@ class FingerTrack:
             self.counters["repeated_readings"] += 1
             return None
         self._slow = finger.slow
+        missed, self._gap = self._gap, 0
         self._tick += 1 + missed
         self.counters["missing_readings"] += missed
         self.counters["samples"] += 1

@@ -63,8 +63,8 @@ class RosMessage(NamedTuple, Generic[T]):
 
     Attributes:
         message: What the bytes say.
-        lost: Messages of its publisher that were lost directly before it; None = unknown, because
-            it does not number them.
+        lost: Messages of its publisher that were lost, or did not decode, directly before it; None
+            = unknown, because it does not number them.
         sent_ns: When it was published, publisher's wall clock [ns since the epoch]; 0 = unknown.
         arrival_ns: Host's monotonic clock when it came [ns].
     """
@@ -100,7 +100,7 @@ class RosSubscription(Generic[T]):
         )
         self._overflow = 0
         self._gid: bytes | None = None
-        self._sequence = 0
+        self._sequence = self._undecoded = 0
         self._heard_s = 0.0
         self._end: DeviceLost | None = None
 
@@ -223,7 +223,11 @@ class RosSubscription(Generic[T]):
                 message = self._decode(sample.payload)
             except WireError as error:
                 self._counts[f"rejected_{error.reason}"] += 1
+                if lost is not None:  # what it held is missing before the next one
+                    self._undecoded += lost + 1
                 continue
+            if lost is not None:
+                lost, self._undecoded = lost + self._undecoded, 0
             sent_ns = 0 if info is None else info.time_ns
             return RosMessage(message, lost, sent_ns, sample.received_monotonic_ns)
 

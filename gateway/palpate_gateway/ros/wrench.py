@@ -19,7 +19,7 @@ from palpate_gateway.ros.subscription import (
     RosSubscription,
     RosTopicOptions,
 )
-from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions
+from palpate_gateway.wrench.device import WrenchDevice, WrenchOptions, is_measured
 
 _ZERO_S = 0.2
 _BEGAN_ANEW = 10
@@ -98,13 +98,13 @@ class RosWrench(WrenchDevice, RosDevice):
         while (left_s := until - time.monotonic()) > 0.0 or not values:
             message = self._topic.next(max(left_s, self._options.wait_s))
             values.append(message.message.values)
-        mean = np.mean(values, axis=0)
-        if not np.isfinite(mean).all():
+        measured = [one for one in values if is_measured(one)]
+        if not measured:
             raise DeviceError(
-                f"{self.info.model}: it sends numbers that are not finite",
+                f"{self.info.model}: it sends nothing but numbers that no sensor measures",
                 remedy="check its driver: ros2 topic echo",
             )
-        self._offset, self._zeroed = mean, self._topic.publisher
+        self._offset, self._zeroed = np.mean(measured, axis=0), self._topic.publisher
 
     def _zero_note(self) -> bytes:
         return self._offset.tobytes() + (self._zeroed or b"")

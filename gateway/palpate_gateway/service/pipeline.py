@@ -117,8 +117,10 @@ class Pipeline:
             if self._tares_itself:
                 self._tares.attempt()
         if kind is not None and (self.condition is None or kind is not self._kind):
-            rate_hz = 1.0 / (identity.slot_period_s * kind.layout.slots)
-            self.condition = Condition(kind.layout, rate_hz, self._limits, self._retare)
+            rate_hz = identity.rate_hz or 1.0 / (identity.slot_period_s * kind.layout.slots)
+            self.condition = Condition(
+                kind.layout, rate_hz, self._limits, self._retare, unfilled=identity.unfilled
+            )
         elif self.condition is not None:
             self.condition.begin(exchanged=exchanged)
         self._kind = kind
@@ -151,12 +153,16 @@ class Pipeline:
         Raises:
             DeviceError: No further frames will come to be averaged.
         """
-        is_record = self._info.driver == "record"
+        never = ""
+        if self._info.sensor_type is None:
+            never = "it has no electrodes"
+        elif self._info.driver == "record":
+            never = "it is a record, which brings its own tares"
         return self._tares.ask(
             frames,
             anyway=anyway,
             sensor=self._serial or "the sensor",
-            never="it is a record, which brings its own tares" if is_record else "",
+            never=never,
         )
 
     def give_up(self, why: str) -> None:

@@ -51,8 +51,8 @@ class VirtualFault(StrictConfig):
     Attributes:
         kind: Kind; see the table above.
         at_s: Begin, from the opening of the device [s].
-        for_s: Duration [s]; 0 = for ever. Of a restart: how long the device is away, 0 = it is back
-            at once.
+        for_s: Duration [s]; 0 = for ever. Of a restart: how long the device is away and cannot be
+            opened, 0 = it is back at once. With ``realtime = false`` the model skips that time.
         electrode: Which electrode, 1..19; None = all 19.
         value: Size; None = the default of the table.
     """

@@ -82,7 +82,7 @@ class VirtualFinger(Device):
         self._faults = FaultPlan((), options.rate_hz, options.seed)
         self._events: dict[str, int] = {}
         self._restarted = False
-        self._begun_s = 0.0
+        self._begun_s = self._back_s = 0.0
         # Three numbers: of the next group in the model's run; of the group at which the device's
         # ticks began; and of frames lost because the host slept (the device's clock went on, the
         # model's run waited).
@@ -96,6 +96,8 @@ class VirtualFinger(Device):
 
     def _open(self) -> DeviceIdentity:
         options = self._options
+        if self._restarted and time.monotonic() < self._back_s:
+            raise self._lost()
         self._events = dict.fromkeys(_EVENTS, 0)
         if self._restarted:
             self._restarted = False
@@ -141,6 +143,8 @@ class VirtualFinger(Device):
                 return []
             away = self._faults.restart(self._now)
             if away is not None:
+                if options.realtime:
+                    self._back_s = time.monotonic() + away / options.rate_hz
                 self._pass_over(away)
                 self._restarted = True
                 raise self._lost()

@@ -106,7 +106,8 @@ class Tare:
         stamp: Stamp of the last frame averaged.
         electrodes: Mean raw counts (the baseline), float32, shape ``(19,)`` (SP: 24).
         electrodes_sd: Standard deviation of the averaged frames [counts], the same shape.
-        pdc: Mean raw PDC [counts]; ``pac``, ``tac`` and ``tdc`` likewise.
+        pdc: Mean raw PDC [counts]; ``pac``, ``tac`` and ``tdc`` likewise, of the valid samples; 0 =
+            there were none.
         frames_averaged: How many frames went in.
     """
 

@@ -186,7 +186,7 @@ def quality_of_frame(frame: ElectrodeFrame, tare: Tare) -> tuple[QualityFlag, ..
     counts = frame.electrodes.tolist()  # for so few numbers plain Python is faster than NumPy
     if 0 in counts or COUNTS_MAX in counts:
         flags = (QualityFlag.SATURATED,)
-    if abs(frame.tdc - tare.tdc) > TARE_TDC_COUNTS:
+    if tare.tdc and abs(frame.tdc - tare.tdc) > TARE_TDC_COUNTS:  # 0 = unknown
         tdc_valid = frame.validity >> frame.sensor_type.layout.tdc_bit & 1
         flags = (*flags, QualityFlag.UNTARED) if tdc_valid else flags
     return flags

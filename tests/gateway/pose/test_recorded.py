@@ -47,14 +47,14 @@ def drain(path: Path, **options: Any) -> tuple[list[PoseReading], dict[str, int]
 
 
 def test_recorded_poses_become_the_tip(tmp_path: Path) -> None:
-    frames = [fakes.frame(n, wall_ns=WALL_NS + n) for n in range(1, 201) if n != 100]
+    frames = [fakes.frame(n, wall_ns=WALL_NS + 4_000_000 * n) for n in range(1, 201) if n != 100]
     readings, counters, start_wall_ns = drain(write(tmp_path / "a.mcap", frames))
     assert fakes.numbers(readings) == [n for n in range(1, 201) if n != 100]
     assert counters == {"samples": 199, "lost_poses": 1}
     assert [r.missed_before for r in readings if r.missed_before] == [1]
     np.testing.assert_allclose(np.diff([r.time_s for r in readings[:99]]), 0.004, atol=1e-9)
     assert readings[99].tick == 101
-    assert start_wall_ns == WALL_NS + 1, "by the robot's clock, not by the recorder's"
+    assert start_wall_ns == WALL_NS + 4_000_000, "by the robot's clock, not by the recorder's"
 
 
 def test_recorded_millimetres_are_no_metres(tmp_path: Path) -> None:
@@ -84,6 +84,54 @@ def test_a_program_that_began_anew_goes_on_by_the_recorders_clock(tmp_path: Path
     assert counters == {"samples": 20, "restarts": 1}
     times = [reading.time_s for reading in readings]
     np.testing.assert_allclose(times, 0.004 * np.arange(20), atol=1e-9)
+
+
+def test_a_second_program_that_has_ended_does_not_lock_the_first_one_out(tmp_path: Path) -> None:
+    frames = [fakes.frame(n, time_ns=1_000_000_000 * n) for n in range(1, 61)]
+    short = fakes.frame(1, run_id=8, time_ns=5)
+    path = write(tmp_path / "a.mcap", [*frames[:5], short, *frames[6:]], period_ns=1_000_000_000)
+    readings, counters, _ = drain(path)
+    assert counters["restarts"] == 2
+    assert counters["poses_of_old_runs"] == 30, "what it published while the other was in force"
+    assert fakes.numbers(readings)[-1] == 60
+
+
+def drifting(count: int, *, tells_wall: bool = False) -> list[RobotPoseFrame]:
+    """Poses a quarter of a second apart, by a clock that runs 200 ppm too fast."""
+    return [
+        replace(
+            fakes.frame(n),
+            time_ns=round(250_000_000 * n * (1 + 200e-6)),
+            wall_ns=WALL_NS + 250_000_000 * (n - 1) if tells_wall else 0,
+        )
+        for n in range(1, count + 1)
+    ]
+
+
+@pytest.mark.parametrize("tells_wall", [False, True])
+def test_the_drift_of_the_robots_clock_does_not_add_up(tmp_path: Path, tells_wall: bool) -> None:
+    frames = drifting(2401, tells_wall=tells_wall)
+    path = write(tmp_path / "a.mcap", frames, period_ns=250_000_000)
+    readings, _, _ = drain(path)
+    assert readings[-1].time_s == pytest.approx(600.0, abs=0.001), "120 ms by the robot's clock"
+
+
+@pytest.mark.parametrize("step_s", [-20.0, 20.0])
+def test_a_wall_clock_that_was_set_while_it_recorded_moves_no_pose(
+    tmp_path: Path, step_s: float
+) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordWriter(path) as writer:
+        for number, frame in enumerate(drifting(400)):
+            writer.write(
+                sensor_key("lab", frame.robot, ROBOT_POSE.name),
+                ROBOT_POSE.codec.schema,
+                ROBOT_POSE.codec.encode(frame),
+                log_time_ns=WALL_NS + 250_000_000 * number + round(1e9 * step_s * (number > 200)),
+            )
+    readings, _, _ = drain(path)
+    steps_s = np.diff([one.time_s for one in readings])
+    np.testing.assert_allclose(steps_s, 0.25, atol=0.01)
 
 
 def test_one_of_several_robots(tmp_path: Path) -> None:

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.bus import Publisher, Session
+from palpate.bus import Publisher, Session, Subscriber
 from palpate.bus.topics import ROBOT_POSE
 from palpate.client import Client
 from palpate.config import LinkConfig
-from palpate.errors import ConfigError, DeviceLost, DeviceTimeout
+from palpate.errors import ConfigError, DeviceLost, DeviceTimeout, LinkError
 from palpate.messages import Origin, Pose
 from palpate.v1 import robot_pb2
 from palpate_gateway.device import BusDevice
@@ -166,6 +166,37 @@ def test_a_program_that_began_anew_is_another_device(
     assert (reading.tick, reading.time_s) == (2, 0.0)
     assert device.counters["poses_of_old_runs"] == 1
     assert device.counters["samples"] == 1
+
+
+def test_a_second_program_that_has_ended_does_not_lock_the_first_one_out(
+    device: BusDevice, told: Publisher[Any]
+) -> None:
+    told.put(fakes.frame(1))
+    told.put(fakes.frame(1, run_id=8, time_ns=5))
+    fakes.take(device, 1)
+    with pytest.raises(DeviceLost, match="restarted"):
+        device.read(PATIENCE_S)
+    for number in (2, 3):  # after the restart, and after the silence of the second program
+        device.close()
+        fakes.until(lambda: not told.matched())
+        device.open()
+        fakes.until(told.matched)
+        told.put(fakes.frame(number))
+        if number == 2:
+            with pytest.raises(DeviceTimeout):
+                device.read(0.2)
+    assert fakes.numbers(fakes.take(device, 1)) == [3]
+
+
+def test_a_bus_that_is_gone_is_a_lost_device(
+    device: BusDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(*_: Any) -> Any:
+        raise LinkError("the session is closed", remedy="open the session again")
+
+    monkeypatch.setattr(Subscriber, "next", gone)
+    with pytest.raises(DeviceLost, match="the session is closed"):
+        device.read(0.1)
 
 
 def test_without_a_router_it_is_lost(free_port: int) -> None:

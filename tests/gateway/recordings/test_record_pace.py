@@ -142,6 +142,18 @@ def test_what_was_played_twice_while_it_was_recorded_comes_twice(
     assert electrodes_s[FRAMES] - electrodes_s[0] == pytest.approx(1.0, abs=2 * PERIOD_S)
 
 
+def test_messages_that_came_in_another_order_move_no_others(
+    record: Callable[..., Path], tmp_path: Path
+) -> None:
+    frames = [item for item in read_record(record(FRAMES)) if item.address.topic == "electrodes"]
+    for k in range(10, 50, 4):
+        frames[k], frames[k + 1] = frames[k + 1], frames[k]
+    times = (item.log_time_ns for item in sorted(frames, key=lambda one: one.log_time_ns))
+    path = changed(frames, tmp_path / "a.mcap", lambda _, stamp: (next(times), stamp))
+    electrodes_s = times_of(path)["electrodes"]
+    assert electrodes_s[-1] - electrodes_s[0] == pytest.approx((FRAMES - 1) * PERIOD_S, abs=1e-5)
+
+
 def _sequence(item: RecordItem) -> int:
     sequence: int = TOPICS[item.address.topic].codec.decode(item.payload).stamp.sequence
     return sequence

@@ -128,6 +128,43 @@ def test_a_clock_that_was_set_back_loses_nothing(tmp_path: Path, dialect: Dialec
     assert counters["missing_readings"] == 0
 
 
+def test_a_clock_that_was_set_back_on_the_recorders_host_too_shows_by_the_numbers(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The bag is sorted by that clock: its messages are mixed, which cannot be undone."""
+    messages = []
+    for k in range(60):
+        at_ns = BEGAN_NS + PERIOD_NS * k - (155_000_000 if k >= 30 else 0)
+        hand = encode(hand_fields(k, at_ns, "ros1"), BIOTAC_HAND, "ros1")
+        messages.append(("/hand", BIOTAC_HAND, at_ns + 12_000_000, hand))
+    _, counters = readings_of(write_bag(tmp_path / "a.bag", messages, "ros1"))
+    assert counters["time_jumps"] > 0
+    assert len([one for one in caplog.messages if "not in the order" in one]) == 1
+
+
+def test_a_driver_that_was_started_again_is_no_jump(tmp_path: Path) -> None:
+    messages = []
+    for k in range(20):
+        at_ns = BEGAN_NS + PERIOD_NS * k
+        hand = encode(hand_fields(k % 10, at_ns, "ros1"), BIOTAC_HAND, "ros1")
+        messages.append(("/hand", BIOTAC_HAND, at_ns, hand))
+    readings, counters = readings_of(write_bag(tmp_path / "a.bag", messages, "ros1"))
+    assert len(readings) == 20
+    assert counters["time_jumps"] == 0
+
+
+@pytest.mark.parametrize("dialect", ["ros1", "cdr"])
+def test_one_message_that_is_stamped_ahead_moves_no_other(tmp_path: Path, dialect: Dialect) -> None:
+    times_s = [0.01 * k + (0.2 if k == 20 else 0.0) for k in range(60)]
+    path = bag_with_times(tmp_path / ("a.bag" if dialect == "ros1" else "a"), dialect, times_s)
+    readings, counters = readings_of(path, wrench_topic="/ft")
+    others_s = [0.01 * k for k in range(60) if k != 20]
+    assert [one.time_s for one in fingers(readings)] == pytest.approx(others_s, abs=1e-6)
+    assert counters["wrenches"] == 59
+    assert counters["early_messages"] == 2  # of both topics
+    assert counters["time_jumps"] == 0
+
+
 def test_a_few_late_messages_are_dropped_and_counted(tmp_path: Path) -> None:
     times_s = [0.01 * k for k in range(20)]
     times_s[7], times_s[12] = 0.045, 0.11
@@ -235,3 +272,9 @@ def test_bytes_flipped_anywhere_never_crash(tmp_path: Path) -> None:
         except (RecordingError, ConfigError):
             continue
         assert all(np.isfinite(one.time_s) for one in readings)
+
+
+def test_a_channel_that_the_driver_does_not_fill_is_told_to_the_gateway(tmp_path: Path) -> None:
+    options = {"path": make_bag(tmp_path / "a.bag", 3), "missing": ["tac", "pac"]}
+    with make_device("ros_bag", options) as device:
+        assert device.identity.unfilled == {"TAC", "PAC"}

@@ -221,6 +221,21 @@ class TestTrack:
         assert second.tick - first.tick == 1 + missed
         assert second.time_s - first.time_s == pytest.approx(0.04)
 
+    @pytest.mark.parametrize("after", ["absent", "repeated"])
+    def test_a_gap_is_told_by_the_next_reading_though_a_message_without_one_comes_first(
+        self, after: str
+    ) -> None:
+        track = FingerTrack(1, rate_hz=100.0)
+        hand = hand_of(0)
+        track.take(hand)
+        empty = replace(hand, time_ns=BEGAN_NS + 4 * PERIOD_NS)
+        if after == "absent":
+            empty = replace(empty, fingers=(None,) * 5)
+        assert track.take(empty) is None
+        reading = track.take(hand_of(5))
+        assert reading is not None
+        assert reading.missed_before == track.counters["missing_readings"] == 3
+
     def test_a_channel_that_was_never_filled_is_marked(self) -> None:
         track = FingerTrack(1, rate_hz=100.0, repeats="keep")
         told = []

@@ -113,6 +113,18 @@ def test_lost_messages_are_missing_readings() -> None:
         assert abs(device.counters["missing_readings"] - lost) <= 2
 
 
+def test_messages_that_do_not_decode_are_missing_readings() -> None:
+    with RosHandEmulator() as emulator, finger_at(emulator, repeats="keep") as device:
+        take(device, 5)
+        emulator.inject("cut", 0.2)
+        eventually(device, lambda: device.counters.get("rejected_parse", 0) > 10)
+        take(device, 5)  # after the fault
+        eventually(device, lambda: not emulator.faulty("cut"))
+        take(device, 5)
+        rejected = device.counters["rejected_parse"] + device.counters["lost_messages"]
+        assert abs(device.counters["missing_readings"] - rejected) <= 2
+
+
 @pytest.mark.parametrize(
     ("fault", "counter"),
     [
@@ -267,6 +279,22 @@ class TestWrench:
             with make_device("ros_wrench", values) as device:
                 take(device, 1500)
                 assert device.counters["lost_messages"] == device.counters["queue_overflow"] == 0
+
+    def test_numbers_that_no_sensor_measures_are_not_in_the_zero(self) -> None:
+        garbage, load = (1e39, 0.0, 0.0, 0.0, 0.0, 0.0), (1.0, 2.0, 3.0, 0.1, 0.2, 0.3)
+        told = itertools.cycle([garbage, load])
+        with RosWrenchEmulator(lambda t: next(told)) as emulator:
+            values = {"topic": emulator.topic, "connect": emulator.address, "zero_at_start": True}
+            with make_device("ros_wrench", values) as device:
+                assert np.abs(take(device, 1)[-1].force).max() < 1e-9
+
+    def test_a_zero_of_nothing_but_garbage_is_refused(self) -> None:
+        with RosWrenchEmulator(lambda t: (1e39, 0.0, 0.0, 0.0, 0.0, 0.0)) as emulator:
+            values = {"topic": emulator.topic, "connect": emulator.address}
+            device = make_device("ros_wrench", values)
+            assert isinstance(device, WrenchDevice)
+            with device, pytest.raises(DeviceError, match="numbers that no sensor measures"):
+                device.take_zero()
 
     def test_a_number_that_is_none_is_dropped(self) -> None:
         with RosWrenchEmulator(ramp) as emulator:

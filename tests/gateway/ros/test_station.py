@@ -39,7 +39,6 @@ def test_fingers_and_wrench_of_ros_are_sensors_of_the_station(bus: Any) -> None:
         assert frame.stamp.sequence == k
         values = [*frame.electrodes, frame.pdc, frame.tac, frame.tdc]
         assert values == slow
-    # The stamp is the begin of the frame, which lasts 10 ms, and never after its arrival.
+    # The stamp is the begin of the frame, which lasts 10 ms and arrives when it is over.
     delays_ns = [one.received_monotonic_ns - one.message.stamp.monotonic_ns for one in frames[20:]]
     assert min(delays_ns) >= 9_900_000
-    assert sorted(delays_ns)[len(delays_ns) // 2] < 1e9 * PATIENCE_S

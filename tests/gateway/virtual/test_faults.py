@@ -235,6 +235,17 @@ def test_restart_counts_from_zero_again_and_the_play_goes_on(runs: Runs) -> None
         until_lost(device, [])
 
 
+def test_a_finger_that_restarts_cannot_be_opened_while_it_is_away(runs: Runs) -> None:
+    away = {"kind": "restart", "at_s": 0.02, "for_s": 30.0}
+    device = runs.device(away, realtime=True, untouched_s=60)
+    with device, pytest.raises(DeviceLost):
+        until_lost(device, [])
+    for _ in range(2):
+        with pytest.raises(DeviceLost, match="restarted"):
+            device.open()
+        assert not device.is_open
+
+
 def test_faults_add_up_and_are_the_same_every_time(runs: Runs) -> None:
     faults = [
         {"kind": "noise", "at_s": 0.5},
