@@ -120,7 +120,7 @@ class _Readings(Generic[Reading]):
     def __init__(
         self, between: Callable[[Stamp, Reading, Reading, float], Reading], remember: int | None
     ) -> None:
-        self._between = between
+        self._between: Callable[[Stamp, Reading, Reading, float], Reading] = between
         self._remember = remember
         self._kept: list[Reading] = []
         self._waiting: deque[tuple[Stamp, MatchedMessages]] = deque(maxlen=remember)

@@ -15,12 +15,21 @@ import time
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from palpate.bus import Delivery, Session, Tap
 from palpate.bus.tares import TareBook
 from palpate.bus.topics import FIELD, FIELD_TRUTH, TARE, TOPICS
 from palpate.errors import PalpateError, StreamTimeout
-from palpate.messages import NO_TARE, ElectrodeFrame, Tare
+from palpate.messages import (
+    NO_TARE,
+    ElectrodeFrame,
+    FeatureEstimate,
+    FieldEstimate,
+    Stamp,
+    SynthesisEstimate,
+    Tare,
+)
 from palpate.process import Closing
 from palpate_services.viewer.layout import MAX_SENSORS, SensorContents
 from palpate_services.viewer.live_view import DrawnPart, LiveView, ViewMessage, ViewPlan
@@ -40,11 +49,15 @@ PERIOD_S = 1.0
 """Time between two parts [s]. Viewers take in a few pieces for each picture that they draw: at
 0.5 s one without a graphics card falls behind for ever."""
 
+SET_BACK_NS = 1_000_000_000
+"""A wall clock that goes back by more than this was set back [ns]; by less, hosts may differ."""
+
 _AGAIN_S = 5.0
 _CLOSE_S = 2.0
 _CAPACITY = 512  # 40 MB if all are fields
 _TURN_S = 0.2
 _FIELDS = frozenset({FIELD.name, FIELD_TRUTH.name})
+_ESTIMATES = (FeatureEstimate, FieldEstimate, SynthesisEstimate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +175,7 @@ class WatchedView(Closing):
         self._told: set[tuple[str, int]] = set()
         self._sensors: set[str] = set()
         self._field_drawn_ns: dict[tuple[str, str], int] = {}
+        self._wall_ns: dict[tuple[str, str], int] = {}
 
     def next_part(self, place: str) -> ViewPart | None:
         """What a viewer draws next; the question says that somebody watches."""
@@ -230,8 +244,8 @@ class WatchedView(Closing):
             recording_id=self.parts.run,
             known=self.parts.contents,
         )
-        chapter = self._chapter
-        self._view = LiveView(plan, lambda part: self.parts.add(chapter, part))
+        chapter, parts = self._chapter, self.parts
+        self._view = LiveView(plan, lambda part: parts.add(chapter, part))
 
     def _end_chapter(self) -> None:
         if self._view is not None:
@@ -268,11 +282,24 @@ class WatchedView(Closing):
             self._counts["view_rejected"] += 1
             return
         self._sensors.add(sample.sensor)
+        if not isinstance(message, Tare) and self._set_back(stream, message):
+            # Viewers stay at the latest time of a recording: they get another one.
+            self._end_chapter()
+            self.parts = KeptParts()
+            self._wall_ns.clear()
+            return
         if isinstance(message, Tare):
             self._told.add((sample.sensor, message.tare_id))
         elif isinstance(message, ElectrodeFrame):
             self._tell_tare(sample.sensor, message.tare_id)
         self._view.offer(ViewMessage(sample.sensor, sample.topic, sample.payload))
+
+    def _set_back(self, stream: tuple[str, str], message: Any) -> bool:
+        """Whether a message was taken long before the last one of its stream, by the wall clock."""
+        stamp: Stamp = message.source if isinstance(message, _ESTIMATES) else message.stamp
+        last_ns = self._wall_ns.get(stream, stamp.wall_ns)
+        self._wall_ns[stream] = stamp.wall_ns
+        return last_ns - stamp.wall_ns > SET_BACK_NS
 
     def _tell_tare(self, sensor: str, tare_id: int) -> None:
         """Hand over the tare that a frame names, once a chapter."""
