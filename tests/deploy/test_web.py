@@ -484,6 +484,8 @@ def test_answers_that_nobody_reads_keep_no_thread(
 
 
 def set_wall_clock(monkeypatch: pytest.MonkeyPatch, by_s: float) -> None:
+    """Set it, when what has been asked for lies there by the clock as it was."""
+    time.sleep(0.5)
     real = time.time
     monkeypatch.setattr(time, "time", lambda: real() + by_s)
 
