@@ -6,6 +6,7 @@ import gzip
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -206,6 +207,30 @@ def test_messages_that_break_the_contract_and_invented_sensors_are_left_out(
     before = watched.got_bytes
     watched.until(lambda: watched.got_bytes > before + 200_000, "the finger is drawn as before")
     assert not watched.counts["view_failed"]
+
+
+def test_sensors_that_are_gone_make_room_for_others(
+    watched: Watched, make_frame: Callable[..., ElectrodeFrame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watched_view, "GONE_S", 2.0)
+    view, names = watched.view, [f"a{number}" for number in range(MAX_SENSORS)]
+    with ExitStack() as earlier:
+        publishers = [
+            earlier.enter_context(view._session.publisher(ELECTRODES, sensor=name))
+            for name in names
+        ]
+        deadline_s = time.monotonic() + PATIENCE_S
+        while sorted(view.parts.contents) != names:
+            assert time.monotonic() < deadline_s
+            view.next_part("")
+            for publisher in publishers:
+                publisher.put(make_frame(1))
+            view.turn()
+            time.sleep(0.02)
+    watched.until(lambda: "finger" in view.parts.contents, "the finger has a tab")
+    assert sorted(view.parts.contents) == ["finger"]
+    view.parts.clear()
+    assert not view.parts.contents, "nor do they come back when nobody has watched for a while"
 
 
 def test_the_files_of_the_viewer_come_out_of_the_installed_package(

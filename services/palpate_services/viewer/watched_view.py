@@ -52,6 +52,9 @@ PERIOD_S = 1.0
 SET_BACK_NS = 1_000_000_000
 """A wall clock that goes back by more than this was set back [ns]; by less, hosts may differ."""
 
+GONE_S = 20.0
+"""A sensor that has sent nothing for so long loses its tab when another one needs it [s]."""
+
 _AGAIN_S = 5.0
 _CLOSE_S = 2.0
 _CAPACITY = 512  # 40 MB if all are fields
@@ -118,6 +121,7 @@ class KeptParts:
         with self._lock:
             self._parts.clear()
             self._chapter_bytes.clear()
+            self.contents = {}
 
     def after(self, place: str) -> ViewPart | None:
         """What comes after a place; an empty or unknown one is the beginning. None = nothing yet.
@@ -153,6 +157,10 @@ def _read_place(place: str) -> tuple[str, int, int]:
     return parts[0], int(parts[1]), int(parts[2])
 
 
+def _gone(last_ns: int, now_ns: int) -> bool:
+    return now_ns - last_ns > GONE_S * 1e9
+
+
 class WatchedView(Closing):
     """Has a station drawn while somebody watches. ``next_part`` is for other threads.
 
@@ -173,7 +181,7 @@ class WatchedView(Closing):
         self._chapter = 0
         self._begun_s = float("-inf")
         self._told: set[tuple[str, int]] = set()
-        self._sensors: set[str] = set()
+        self._sensors: dict[str, int] = {}  # when it last sent, monotonic clock [ns]
         self._field_drawn_ns: dict[tuple[str, str], int] = {}
         self._wall_ns: dict[tuple[str, str], int] = {}
 
@@ -235,6 +243,9 @@ class WatchedView(Closing):
         self._chapter += 1
         self._begun_s = time.monotonic()
         self._told.clear()
+        now_ns = time.monotonic_ns()
+        self._sensors = {name: ns for name, ns in self._sensors.items() if not _gone(ns, now_ns)}
+        shown = self.parts.contents
         plan = ViewPlan(
             None,
             self._title,
@@ -242,7 +253,7 @@ class WatchedView(Closing):
             self._bundles,
             period_s=PERIOD_S,
             recording_id=self.parts.run,
-            known=self.parts.contents,
+            known={name: shown[name] for name in shown if name in self._sensors},
         )
         chapter, parts = self._chapter, self.parts
         self._view = LiveView(plan, lambda part: parts.add(chapter, part))
@@ -263,16 +274,19 @@ class WatchedView(Closing):
         sample = tap.next(0.0)
         if self._view is None:
             return
+        now_ns = sample.received_monotonic_ns
         if sample.sensor not in self._sensors and len(self._sensors) >= MAX_SENSORS:
             self._counts["view_no_room"] += 1
+            if any(_gone(last_ns, now_ns) for last_ns in self._sensors.values()):
+                self._end_chapter()  # the next one has room
             return
         stream = sample.sensor, sample.topic
         if sample.topic in _FIELDS:
             # Large, and the view leaves out most of them anyway.
             last_ns = self._field_drawn_ns.get(stream, 0)
-            if sample.received_monotonic_ns - last_ns < DRAW_PERIOD_NS:
+            if now_ns - last_ns < DRAW_PERIOD_NS:
                 return
-            self._field_drawn_ns[stream] = sample.received_monotonic_ns
+            self._field_drawn_ns[stream] = now_ns
         topic = TOPICS[sample.topic]
         message = None
         with contextlib.suppress(PalpateError):
@@ -281,7 +295,7 @@ class WatchedView(Closing):
         if message is None:
             self._counts["view_rejected"] += 1
             return
-        self._sensors.add(sample.sensor)
+        self._sensors[sample.sensor] = now_ns
         if not isinstance(message, Tare) and self._set_back(stream, message):
             # Viewers stay at the latest time of a recording: they get another one.
             self._end_chapter()
