@@ -121,6 +121,7 @@ def test_a_station_answers_only_if_a_process_beside_the_page_does() -> None:
 def test_invented_processes_are_bounded() -> None:
     many = [dataclasses.replace(GATEWAY, instance=f"g{n}") for n in range(3 * PROCESSES_MOST)]
     found = seen(*many)
+    assert found["well"] == 3 * PROCESSES_MOST
     assert len(found["processes"]) == len(found["sensors"]) == PROCESSES_MOST
     assert found["left_out"] == 2 * PROCESSES_MOST
 

@@ -14,6 +14,11 @@ from typing import Any
 
 import pytest
 
+from palpate.census import ProcessReport
+from palpate.messages import SensorState, SensorStatus, ServiceState, Status
+from palpate_deploy.station.observation import ObservedProcess
+from palpate_deploy.station.web.snapshot import PROCESSES_MOST, as_json, snapshot
+
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="node not installed")
 
 PATIENCE_S = 120.0
@@ -47,6 +52,29 @@ wasm_bindgen.WebHandle = class {
 const end = () => { console.log(JSON.stringify({ said, parts })); process.exit(0); };
 console.error = end; // the viewer has ended
 require("vm").runInThisContext(require("fs").readFileSync(script, "utf8"));
+}
+"""
+
+PAGE_OF = """
+{
+const [script, status] = process.argv.slice(1);
+const made = () => ({
+  textContent: "", cells: [], classList: { toggle() {} }, addEventListener() {}, setAttribute() {},
+  append(...more) { this.cells.push(...more); },
+  replaceChildren(...all) { this.cells = all; },
+});
+const elements = {};
+globalThis.fetch = () => new Promise(() => {});
+globalThis.location = { hash: "" };
+globalThis.addEventListener = () => {};
+globalThis.document = {
+  getElementById: (id) => elements[id] ??= made(), createElement: made, body: made(),
+};
+require("vm").runInThisContext(require("fs").readFileSync(script, "utf8"));
+show(JSON.parse(status));
+const rows = elements.sensors.cells.map((row) => row.cells.map((cell) => cell.textContent));
+console.log(JSON.stringify({ whole: elements.whole.textContent, rows }));
+process.exit(0);
 }
 """
 
@@ -102,3 +130,37 @@ def test_a_live_view_outlives_answers_that_are_cut_in_the_middle(failing: str) -
     assert "The station does not answer." in found["said"]
     assert "re_viewer.js cannot be loaded." in found["said"]
     assert found["said"][-1] == ""
+
+
+def shown(*statuses: Status) -> dict[str, Any]:
+    """What the page shows of processes with these statuses."""
+    observed = [
+        ObservedProcess(ProcessReport(one.service, one.instance, True, True, one), 0.4, {})
+        for one in statuses
+    ]
+    plain = snapshot("lab", observed, router=True, own=("web", "web"))
+    return run(PAGE_OF, str(PAGE / "page.js"), as_json({**plain, "live": False}).decode())
+
+
+def gateway(name: str, **gauges: float) -> Status:
+    states = (SensorStatus(name, SensorState.LIVE, 1),)
+    return Status(
+        "gateway", name, ServiceState.READY, 2, 1, 60.0, "1", {}, gauges, sensor_states=states
+    )
+
+
+def test_only_a_finger_can_be_not_tared() -> None:
+    found = shown(
+        gateway("thumb", warm_up=0.0, tare_age_s=61.0),
+        gateway("ring", warm_up=1.0),
+        gateway("force", publish_p50_s=1e-3),
+    )
+    heads, *rows = found["rows"]
+    ages = {row[0]: row[heads.index("tare age")] for row in rows}
+    assert ages == {"thumb": "1:01", "ring": "not tared", "force": "–"}
+    assert found["whole"] == "3 of 3 processes well"
+
+
+def test_processes_that_are_not_shown_are_counted() -> None:
+    found = shown(*[gateway(f"g{number}") for number in range(PROCESSES_MOST + 3)])
+    assert found["whole"] == "67 of 67 processes well, 3 not shown"
