@@ -57,7 +57,9 @@ def estimate(stamp: Stamp, force_n: float = 3.0) -> FeatureEstimate:
 
 def press(stamp: Stamp) -> list[Any]:
     """A quarter of a second of a press of 3 N, of which each kind has its own rate and phase."""
-    timed = [(at + 0.311, wrench(later(stamp, at + 0.311), 3.0)) for at in range(250)]
+    timed: list[tuple[float, Any]] = [
+        (at + 0.311, wrench(later(stamp, at + 0.311), 3.0)) for at in range(250)
+    ]
     timed += [(at + 0.077, pose(later(stamp, at + 0.077))) for at in range(0, 250, 10)]
     timed += [(float(at), estimate(later(stamp, at))) for at in range(0, 250, 10)]
     return [message for _, message in sorted(timed, key=lambda each: each[0])]
@@ -104,7 +106,7 @@ def test_errors_of_a_record_are_told_of_a_sensor_with_its_own_clock(
 def test_truth_lies_on_the_line_between_its_neighbours(
     stamp: Stamp, order: tuple[int, ...]
 ) -> None:
-    messages = [
+    messages: list[Any] = [
         wrench(later(stamp, 0.0), 1.0),
         wrench(later(stamp, 4.0), 5.0),
         estimate(later(stamp, 1.0)),
