@@ -16,7 +16,8 @@ from palpate.errors import ConfigError, LinkError
 from palpate.health import Health, HealthReporter
 from palpate.messages import ServiceState
 from palpate_deploy.station import fleet
-from palpate_deploy.station.fleet import look_at_fleet, show_fleet
+from palpate_deploy.station.activity import SensorActivity
+from palpate_deploy.station.fleet import StationSummary, look_at_fleet, show_fleet
 from palpate_deploy.station.profile import load_profile
 
 
@@ -70,6 +71,20 @@ def test_a_name_that_no_station_can_have_hides_no_other(
 def test_nobody_is_a_failure(link: LinkConfig) -> None:
     assert look_at_fleet(link) == []
     assert show_fleet(link, as_json=False) == 1
+
+
+def test_only_a_finger_is_said_to_have_no_tare(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ring = SensorActivity("ring", "gateway", "live", 1.0, tactile=True)
+    force = SensorActivity("force", "gateway", "live", 1.0)
+    found = [StationSummary("arm1", [], [ring, force])]
+    monkeypatch.setattr(fleet, "look_at_fleet", lambda _: found)
+    show_fleet(LinkConfig(), as_json=False)
+    shown = capsys.readouterr().out
+    assert "ring live - no tare" in shown
+    assert "force live -" in shown
+    assert shown.count("tare") == 1
 
 
 PROFILE = """

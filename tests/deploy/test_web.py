@@ -27,6 +27,7 @@ from palpate_deploy.station.web import process as web
 from palpate_deploy.station.web.application import WebApplication
 from palpate_deploy.station.web.process import run_web
 from palpate_deploy.station.web.snapshot import PROCESSES_MOST, as_json, snapshot
+from palpate_services.viewer import viewer_files
 
 pytest.importorskip("waitress", reason="waitress not installed (extra web)")
 
@@ -120,6 +121,7 @@ def test_a_station_answers_only_if_a_process_beside_the_page_does() -> None:
 def test_invented_processes_are_bounded() -> None:
     many = [dataclasses.replace(GATEWAY, instance=f"g{n}") for n in range(3 * PROCESSES_MOST)]
     found = seen(*many)
+    assert found["well"] == 3 * PROCESSES_MOST
     assert len(found["processes"]) == len(found["sensors"]) == PROCESSES_MOST
     assert found["left_out"] == 2 * PROCESSES_MOST
 
@@ -288,6 +290,28 @@ def test_files_of_the_viewer_are_kept_by_browsers_and_checked() -> None:
     assert ask("/viewer/re_viewer.js", HTTP_IF_NONE_MATCH=reply.headers["ETag"]).status == 304
     prepared = ask("/viewer/re_viewer_bg.wasm")
     assert (prepared.status, prepared.headers["Retry-After"]) == (503, "1")
+
+
+def test_why_there_is_no_viewer_reaches_the_browser(
+    monkeypatch: pytest.MonkeyPatch, wait_until: WaitUntil
+) -> None:
+    tries = []
+
+    def fetch() -> dict[str, bytes]:
+        tries.append(1)
+        raise OSError("no room")
+
+    monkeypatch.setattr(viewer_files, "fetch_viewer_files", fetch)
+    app = WebApplication([], Health("web", "web"), Drawn(), viewer_files.ViewerFiles(), "1")
+
+    def said() -> bytes:
+        return ask("/viewer/re_viewer.js", application=app).body
+
+    wait_until(lambda: b"no room" in said(), PATIENCE_S, "it says why")
+    assert all(b"no room" in said() for _ in range(20))
+    assert len(tries) == 1, "its program is not started at each question"
+    monkeypatch.setattr(viewer_files, "AGAIN_S", 0.0)
+    wait_until(lambda: b"no room" in said() and len(tries) > 1, PATIENCE_S, "it tries again")
 
 
 def test_without_a_live_view_there_are_no_parts_and_the_page_stays() -> None:
@@ -460,15 +484,37 @@ def test_answers_that_nobody_reads_keep_no_thread(
         assert [status() for _ in range(5)] == [200] * 5
 
 
+def set_wall_clock(monkeypatch: pytest.MonkeyPatch, by_s: float) -> None:
+    """Set it, when what has been asked for lies there by the clock as it was."""
+    time.sleep(0.5)
+    real = time.time
+    monkeypatch.setattr(time, "time", lambda: real() + by_s)
+
+
+@pytest.mark.parametrize("step_s", [0.0, -3600.0])
 def test_connections_whose_answer_nobody_reads_are_closed(
-    free_port: int, monkeypatch: pytest.MonkeyPatch
+    free_port: int, monkeypatch: pytest.MonkeyPatch, step_s: float
 ) -> None:
     monkeypatch.setattr(web, "CONNECTIONS_MOST", 5)
     monkeypatch.setattr(web, "IDLE_S", 1)
     with ExitStack() as held, serving_a_large_file(free_port) as status:
         for _ in range(20):
             held.enter_context(not_reading(free_port, questions=1))
+        set_wall_clock(monkeypatch, step_s)
         assert status() == 200
+
+
+def test_a_wall_clock_that_is_set_forward_closes_no_connection(
+    free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(web, "IDLE_S", 3600)
+    with serving_a_large_file(free_port) as status, not_reading(free_port, questions=1) as slow:
+        came = len(slow.recv(1000))
+        set_wall_clock(monkeypatch, 7200.0)
+        assert [status() for _ in range(5)] == [200] * 5
+        while some := slow.recv(1 << 20):
+            came += len(some)
+    assert came > 14_000_000
 
 
 def test_a_name_of_two_addresses_is_served_and_stopped(

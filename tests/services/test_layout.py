@@ -112,6 +112,14 @@ def test_electrodes_bear_their_numbers_in_the_colours_of_their_curves(kind: Sens
     ]
 
 
+def test_an_sp_takes_the_body_of_a_finger_that_was_there_before_away() -> None:
+    """That one may have been drawn by another process, in the chapter before."""
+    biotac, sp = (dict(record_fixtures(kind)) for kind in SensorType)
+    for body in ("finger/core", "finger/skin"):
+        assert all(len(batch.as_arrow_array()) for batch in biotac[body].as_component_batches())
+        assert not any(len(batch.as_arrow_array()) for batch in sp[body].as_component_batches())
+
+
 def test_an_electrode_without_a_reading_is_neither_pressed_nor_at_rest() -> None:
     tared = np.array([[np.nan, 0.0, -400.0], [400.0, np.nan, 0.0]], np.float32)
     with np.errstate(all="raise"):

@@ -24,8 +24,9 @@ from palpate.messages import (
     Stamp,
     WrenchFrame,
 )
-from palpate_services.viewer.timeline import MatchedMessages, SensorTimeline, line_of_action
+from palpate_services.viewer.timeline import SensorTimeline, line_of_action
 from palpate_services.viewer.touch_errors import bins_of, read_touches
+from palpate_services.viewer.truth import MatchedMessages
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -133,8 +134,15 @@ def test_where_nothing_is_known_there_is_no_number(stamp: Stamp) -> None:
     without_truth = bins_of([MatchedMessages(None, pose, estimate)])
     assert {each.frames for each in without_truth} == {0}
     assert without_truth[0].force_median_n is None
-    robot = bins_of(matched(stamp, [Press(3.0, 0.1, touches=None)]))
-    assert (robot[0].frames, robot[0].located, robot[0].location_median_m) == (1, 0, None)
+    away = bins_of(matched(stamp, [Press(3.0, 0.1, touches=False)]))
+    assert (away[0].frames, away[0].located, away[0].location_median_m) == (1, 0, None)
+
+
+def test_where_a_robot_cannot_know_a_touch_the_true_force_says_it(stamp: Stamp) -> None:
+    robot = [Press(3.0, 0.1, touches=None), Press(0.0, 0.1, touches=None)]
+    bins = bins_of(matched(stamp, robot))
+    assert bins[0].location_median_m == pytest.approx(1e-3, rel=1e-4)
+    assert (bins[-1].frames, bins[-1].located) == (2, 1)
 
 
 def record_of(path: Path, stamp: Stamp, presses: Sequence[Press], *, fields: bool = True) -> Path:

@@ -23,11 +23,11 @@ from palpate.messages import (
     SynthesisEstimate,
     Tare,
 )
-from palpate_services.viewer.timeline import TruthMatcher
 from palpate_services.viewer.touch_errors import TOUCHED_N
+from palpate_services.viewer.truth import TruthMatcher
 
 _KEPT = 500
-"""Instants whose truth and estimate may wait for each other: five seconds at 100 Hz."""
+"""Readings of the truth that an estimate may ask for: five seconds at 100 Hz."""
 
 _WAITING = 200
 """Estimates and frames that wait for what they are compared with."""
@@ -107,8 +107,8 @@ class TouchComparison:
         self.count += 1
         age_s = clock.age_s(estimate.source, monotonic_ns=received.received_monotonic_ns)
         self._ages_s.append(age_s)
-        instant = self._matcher.add(estimate)
-        wrench, pose = instant.wrench, instant.pose
+        (match,) = self._matcher.add(estimate)
+        wrench, pose = match.wrench, match.pose
         if wrench is None:
             return
         # None = the source cannot tell; that counts as contact, as does a missing pose.

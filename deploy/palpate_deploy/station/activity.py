@@ -99,6 +99,7 @@ class SensorActivity:
         tare_age_s: Age of the tare in force [s]; None = there is none.
         tare_drift_counts: Drift of the worst electrode when last untouched [counts].
         message: What is wrong or to be done, for people; a live sensor may have to be tared.
+        tactile: Whether it is a BioTac, which is tared; other sensors have no tare.
     """
 
     name: str
@@ -111,6 +112,7 @@ class SensorActivity:
     tare_age_s: float | None = None
     tare_drift_counts: float | None = None
     message: str = ""
+    tactile: bool = False
 
 
 def process_activities(observed: Iterable[ObservedProcess]) -> list[ProcessActivity]:
@@ -236,6 +238,7 @@ def _sensor(observed: ObservedProcess, status: Status, sensor: SensorStatus) -> 
         gauges.get("tare_age_s"),
         gauges.get("tare_drift_counts"),
         sensor.message,
+        "warm_up" in gauges,
     )
 
 

@@ -156,8 +156,12 @@ def _print(console: Console, found: Sequence[StationSummary]) -> None:
 
 def _sensor(sensor: SensorActivity) -> str:
     rate = "-" if sensor.rate_hz is None else f"{sensor.rate_hz:.0f}/s"
-    tare = "no tare" if sensor.tare_age_s is None else f"tare {duration_text(sensor.tare_age_s)}"
-    return cell(f"{sensor.name} {sensor.state.replace('_', ' ')} {rate} {tare}")
+    words = [sensor.name, sensor.state.replace("_", " "), rate]
+    if sensor.tare_age_s is not None:
+        words.append(f"tare {duration_text(sensor.tare_age_s)}")
+    elif sensor.tactile:
+        words.append("no tare")
+    return cell(" ".join(words))
 
 
 def _estimates(process: ProcessActivity) -> str:

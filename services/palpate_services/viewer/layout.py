@@ -193,12 +193,11 @@ def _trajectory_tab(rrb: Any, trajectory: str, longest_m: float) -> Any:
     )
 
 
-def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[str, Any]]:
+def record_fixtures(kind: SensorType) -> Iterator[tuple[str, Any]]:
     """What never changes, as entity (below the sensor) and value: names, colours, the body.
 
     The electrodes of a BioTac SP are drawn in the sensor frame of their table and without a body,
-    because no source gives its shape. ``again``: these replace the fixtures of another type (an
-    exchanged finger).
+    because no source gives its shape; that of a finger which was there before is taken away.
     """
     rr = require("rerun", extra="services")
 
@@ -232,7 +231,7 @@ def record_fixtures(kind: SensorType, *, again: bool = False) -> Iterator[tuple[
         yield "finger/core", core
         skin = rr.LineStrips3D(skin_lines(), colors=[(110, 150, 190)], radii=[6e-5])
         yield "finger/skin", skin
-    elif again:
+    else:
         yield "finger/core", rr.Mesh3D.cleared()
         yield "finger/skin", rr.LineStrips3D.cleared()
     positions = ELECTRODE_PLACES[kind]

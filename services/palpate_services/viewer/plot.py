@@ -12,7 +12,6 @@ import numpy.typing as npt
 from palpate.files.atomic import written_whole
 from palpate.process import require
 from palpate_services.inference.repository import MeshLibrary
-from palpate_services.viewer.timeline import MatchedMessages
 from palpate_services.viewer.touch_errors import TOUCHED_N, RecordErrors, read_touches
 from palpate_services.viewer.touch_picture import (
     ESTIMATE,
@@ -23,6 +22,7 @@ from palpate_services.viewer.touch_picture import (
     draw_touch,
     typical_touch,
 )
+from palpate_services.viewer.truth import MatchedMessages
 
 Points = npt.NDArray[np.float64]
 
@@ -156,10 +156,7 @@ def _force_rows(matched: Sequence[MatchedMessages]) -> tuple[Points, Points]:
 
 
 def _location_rows(matched: Sequence[MatchedMessages]) -> tuple[Points, Points]:
-    truth = [
-        _or_nan(item.pose.position if item.pose is not None and item.pose.in_contact else None)
-        for item in matched
-    ]
+    truth = [_or_nan(item.true_location) for item in matched]
     estimate = [_or_nan(item.estimate and item.estimate.contact_location) for item in matched]
     return MM_PER_M * np.stack(truth), MM_PER_M * np.stack(estimate)
 

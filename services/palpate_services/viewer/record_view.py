@@ -277,7 +277,7 @@ class RerunView:
         for sensor in sensors:
             kind, known = drawn[sensor].kind, before.get(sensor)
             if known is None or known.kind is not kind:
-                for entity, value in record_fixtures(kind, again=known is not None):
+                for entity, value in record_fixtures(kind):
                     self._stream.log(f"{sensor}/{entity}", value, static=True)
 
     def _draw(self, sensor: str, timeline: SensorTimeline) -> None:

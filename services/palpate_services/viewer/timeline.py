@@ -6,14 +6,13 @@ Free of any drawing library, so that ``record_view`` and ``plot`` remain thin.
 from __future__ import annotations
 
 import logging
-from collections import Counter, OrderedDict, defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from palpate.bus.topics import TOPICS
 from palpate.errors import WireError
@@ -33,6 +32,7 @@ from palpate.messages import (
     WrenchFrame,
     as_field_frame,
 )
+from palpate_services.viewer.truth import LEAST_N, MatchedMessages, TruthMatcher, Values
 
 _log = logging.getLogger(__name__)
 
@@ -113,15 +113,7 @@ class FieldThinner:
         return row
 
 
-Values = npt.NDArray[Any]
-
-REMEMBERED = 1024
-"""Instants for which truth and estimate may wait for each other: 10 s at 100 Hz, 3 MB."""
-
 _NOWHERE = np.full(3, np.nan)
-
-_LEAST_N = 0.1
-"""A smaller force [N] is mostly noise, which would put its line anywhere."""
 
 _MM_PER_M = 1e3
 """Rerun shows 0.0012 m as 0.00 on its axis; people read a fingertip in millimetres."""
@@ -144,59 +136,6 @@ class TimelineRow:
     values: Any
     at: Values | None = None
     slot_period_ns: int = 0
-
-
-@dataclass(slots=True)
-class MatchedMessages:
-    """Truth and estimate of one sensor at one instant, matched by monotonic time."""
-
-    wrench: WrenchFrame | None = None
-    pose: IndenterPoseFrame | None = None
-    estimate: FeatureEstimate | None = None
-
-    def force_error(self) -> Values | None:
-        """Estimate minus truth [N], shape ``(3,)``; None without both."""
-        if self.estimate is None or self.wrench is None:
-            return None
-        return self.estimate.force.astype(np.float64) - self.wrench.force
-
-    def location_error(self) -> Values | None:
-        """Estimate minus truth [m], shape ``(3,)``; None without both, or without contact."""
-        if self.estimate is None or self.pose is None or not self.pose.in_contact:
-            return None
-        if self.estimate.contact_location is None:
-            return None
-        return self.estimate.contact_location.astype(np.float64) - self.pose.position
-
-
-class TruthMatcher:
-    """Matches messages of the same instant, in whatever order they arrive.
-
-    Args:
-        remember: Instants kept; the oldest is forgotten first. None = all.
-    """
-
-    def __init__(self, remember: int | None = REMEMBERED) -> None:
-        self._remember = remember
-        self._instants: OrderedDict[int, MatchedMessages] = OrderedDict()
-
-    def add(self, message: WrenchFrame | IndenterPoseFrame | FeatureEstimate) -> MatchedMessages:
-        """Add a message; returns what is known of its instant."""
-        stamp = message.source if isinstance(message, FeatureEstimate) else message.stamp
-        instant = self._instants.setdefault(stamp.monotonic_ns, MatchedMessages())
-        if isinstance(message, FeatureEstimate):
-            instant.estimate = message
-        elif isinstance(message, WrenchFrame):
-            instant.wrench = message
-        else:
-            instant.pose = message
-        if self._remember is not None and len(self._instants) > self._remember:
-            self._instants.popitem(last=False)
-        return instant
-
-    def instants(self) -> Mapping[int, MatchedMessages]:
-        """Matched messages by monotonic time [ns]."""
-        return self._instants
 
 
 class SensorTimeline:
@@ -228,16 +167,18 @@ class SensorTimeline:
         elif isinstance(message, FeatureEstimate):
             self._add_estimate(message)
         elif isinstance(message, WrenchFrame):
-            instant = self._matcher.add(message)
             self._rows["force/truth"].append(_row(message.stamp, message.force))
-            self._add_true_arrow(instant)
-            self._add_error("force", message.stamp, instant.force_error())
+            for match in self._matcher.add(message):
+                self._add_true_arrow(match)
+                self._add_force_error(match)
+                if match.pose is not None and match.pose.in_contact is None:
+                    self._add_location_error(match)  # only the force says whether it is touched
         elif isinstance(message, IndenterPoseFrame):
-            instant = self._matcher.add(message)
-            position = message.position if message.in_contact else None
+            position = None if message.in_contact is False else message.position
             self._rows["location/truth"].append(_row(message.stamp, position))
-            self._add_true_arrow(instant)
-            self._add_location_error(message.stamp, instant)
+            for match in self._matcher.add(message):
+                self._add_true_arrow(match)
+                self._add_location_error(match)
         elif isinstance(message, FieldFrame):
             self._add_field("truth", message)
         elif isinstance(message, FieldEstimate):
@@ -281,7 +222,7 @@ class SensorTimeline:
         self._rows["pressure"].append(row)
 
     def _add_estimate(self, estimate: FeatureEstimate) -> None:
-        instant = self._matcher.add(estimate)
+        (match,) = self._matcher.add(estimate)
         location = estimate.contact_location
         # The centre of pressure is where the force acts; the location may be off the skin.
         acts_at = location if estimate.centre_of_pressure is None else estimate.centre_of_pressure
@@ -289,8 +230,8 @@ class SensorTimeline:
         self._rows["force/estimate"].append(row)
         self._rows["arrow/estimate"].append(row)
         self._rows["location/estimate"].append(_row(estimate.source, location))
-        self._add_error("force", estimate.source, instant.force_error())
-        self._add_location_error(estimate.source, instant)
+        self._add_force_error(match)
+        self._add_location_error(match)
         if (bounds := estimate.bounds) is not None:
             place = bounds.contact_location
             for what, bound in (
@@ -307,21 +248,26 @@ class SensorTimeline:
         if row is not None:
             self._rows[f"field/{name}"].append(row)
 
-    def _add_true_arrow(self, instant: MatchedMessages) -> None:
-        if instant.wrench is not None and instant.pose is not None:
-            at = _acts_near(instant.wrench, instant.pose) if instant.pose.in_contact else None
-            row = _row(instant.wrench.stamp, instant.wrench.force, at=at)
-            self._rows["arrow/truth"].append(row)
+    def _add_true_arrow(self, match: MatchedMessages) -> None:
+        """The true force at the instant of a pose."""
+        if match.estimate is None and match.wrench is not None and match.pose is not None:
+            untouched = match.pose.in_contact is False
+            at = None if untouched else _acts_near(match.wrench, match.pose)
+            self._rows["arrow/truth"].append(_row(match.pose.stamp, match.wrench.force, at=at))
 
-    def _add_location_error(self, stamp: Stamp, instant: MatchedMessages) -> None:
-        error = instant.location_error()
-        if error is None and instant.estimate is not None and instant.pose is not None:
+    def _add_force_error(self, match: MatchedMessages) -> None:
+        self._add_error("force", match, match.force_error())
+
+    def _add_location_error(self, match: MatchedMessages) -> None:
+        error = match.location_error()
+        if error is None and match.pose is not None and match.touched is not None:
             error = _NOWHERE  # a gap in the line, not a line across the time without contact
-        self._add_error("location_mm", stamp, None if error is None else _MM_PER_M * error)
+        self._add_error("location_mm", match, None if error is None else _MM_PER_M * error)
 
-    def _add_error(self, what: str, stamp: Stamp, error: Values | None) -> None:
-        if error is not None:
-            self._rows[f"error/{what}"].append(_row(stamp, np.array([np.linalg.norm(error)])))
+    def _add_error(self, what: str, match: MatchedMessages, error: Values | None) -> None:
+        if error is not None and match.estimate is not None:
+            row = _row(match.estimate.source, np.array([np.linalg.norm(error)]))
+            self._rows[f"error/{what}"].append(row)
 
 
 def line_of_action(wrench: WrenchFrame) -> tuple[Values, Values] | None:
@@ -331,7 +277,7 @@ def line_of_action(wrench: WrenchFrame) -> tuple[Values, Values] | None:
     """
     force, torque = wrench.force.astype(np.float64), np.asarray(wrench.torque, np.float64)
     size = float(np.linalg.norm(force))
-    if size < _LEAST_N or not torque.any():
+    if size < LEAST_N or not torque.any():
         return None
     return np.cross(force, torque) / size**2, force / size
 

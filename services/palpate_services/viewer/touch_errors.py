@@ -7,7 +7,7 @@ So errors are counted by the true force, and those of touched frames come first.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,8 @@ import numpy.typing as npt
 from palpate.errors import RecordingError
 from palpate.files.record import read_record
 from palpate.messages import FeatureEstimate, FieldEstimate, IndenterPoseFrame, WrenchFrame
-from palpate_services.viewer.timeline import (
-    MatchedMessages,
-    TruthMatcher,
-    message_of,
-    tell_left_out,
-)
+from palpate_services.viewer.timeline import message_of, tell_left_out
+from palpate_services.viewer.truth import MatchedMessages, TruthMatcher
 
 TOUCHED_N = 0.5
 """A finger counts as touched from this true force on [N]: less than a robot grips anything with."""
@@ -182,7 +178,7 @@ def read_touches(record: Path, *, sensor: str | None = None) -> RecordedTouches:
         RecordingError: The record is damaged or holds no estimates.
     """
     matchers: dict[str, TruthMatcher] = {}
-    estimates: dict[str, int] = {}
+    matches: dict[str, dict[int, MatchedMessages]] = {}
     fields: dict[str, set[int]] = {}
     counts: Counter[str] = Counter()
     for item in read_record(record):
@@ -196,21 +192,20 @@ def read_touches(record: Path, *, sensor: str | None = None) -> RecordedTouches:
             fields.setdefault(whose, set()).add(message.source.monotonic_ns)
             continue
         assert isinstance(message, FeatureEstimate | IndenterPoseFrame | WrenchFrame)
-        matchers.setdefault(whose, TruthMatcher(remember=None)).add(message)
+        found = matchers.setdefault(whose, TruthMatcher(remember=None)).add(message)
         if isinstance(message, FeatureEstimate):
-            estimates[whose] = estimates.get(whose, 0) + 1
+            matches.setdefault(whose, {})[message.source.monotonic_ns] = found[0]
     tell_left_out(record, counts)
-    if not estimates:
+    if not matches:
         of_whom = "" if sensor is None else f" of the sensor {sensor!r}"
         raise RecordingError(
             f"{record} holds no estimates{of_whom}", remedy="record while the features service runs"
         )
-    name = max(estimates, key=lambda key: estimates[key])
-    instants: Mapping[int, MatchedMessages] = matchers[name].instants()
-    times = sorted(ns for ns, item in instants.items() if item.estimate is not None)
+    name = max(matches, key=lambda key: len(matches[key]))
+    times = sorted(matches[name])
     return RecordedTouches(
         name,
         np.array(times, np.int64),
-        [instants[ns] for ns in times],
+        [matches[name][ns] for ns in times],
         frozenset(fields.get(name, ())),
     )

@@ -17,8 +17,9 @@ from palpate.messages import FieldEstimate, FieldFrame, FloatArray, WrenchFrame
 from palpate.process import require
 from palpate_services.inference.repository import MeshLibrary
 from palpate_services.viewer.surfaces import normals_of, shades
-from palpate_services.viewer.timeline import MatchedMessages, line_of_action, message_of
+from palpate_services.viewer.timeline import line_of_action, message_of
 from palpate_services.viewer.touch_errors import TOUCHED_N, RecordedTouches
+from palpate_services.viewer.truth import MatchedMessages
 
 INK = "#30343b"
 TRUTH = "#16181c"

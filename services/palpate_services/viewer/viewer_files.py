@@ -26,6 +26,9 @@ VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 START_S = 60.0
 """How long Rerun's program may take until it serves [s]; on an idle machine half a second."""
 
+AGAIN_S = 10.0
+"""After a failure the next attempt begins so much later at the earliest [s]."""
+
 _POLL_S = 0.2
 _ANSWER_S = 60.0
 _DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
@@ -44,6 +47,7 @@ class ViewerFiles:
         self._files: Mapping[str, bytes] | None = None
         self._problem = ""
         self._thread: threading.Thread | None = None
+        self._failed_s = float("-inf")
 
     def find(self, name: str) -> bytes | None:
         """A file, compressed with gzip; None while it is being fetched, see ``problem``.
@@ -56,15 +60,14 @@ class ViewerFiles:
         with self._lock:
             if self._files is not None:
                 return self._files[name]
-            if self._thread is None:
-                self._problem = ""
+            if self._thread is None and time.monotonic() - self._failed_s >= AGAIN_S:
                 self._thread = threading.Thread(target=self._fetch, name="viewer", daemon=True)
                 self._thread.start()
         return None
 
     @property
     def problem(self) -> str:
-        """Why the last attempt failed; empty = it did not. The next question tries again."""
+        """Why the last attempt that has ended failed; empty = none has. Questions try again."""
         with self._lock:
             return self._problem
 
@@ -77,6 +80,7 @@ class ViewerFiles:
             _log.warning("%s", problem)
         with self._lock:
             self._files, self._problem, self._thread = files, problem, None
+            self._failed_s = time.monotonic()
 
 
 def fetch_viewer_files() -> dict[str, bytes]:

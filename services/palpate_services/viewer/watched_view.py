@@ -15,12 +15,21 @@ import time
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from palpate.bus import Delivery, Session, Tap
 from palpate.bus.tares import TareBook
 from palpate.bus.topics import FIELD, FIELD_TRUTH, TARE, TOPICS
 from palpate.errors import PalpateError, StreamTimeout
-from palpate.messages import NO_TARE, ElectrodeFrame, Tare
+from palpate.messages import (
+    NO_TARE,
+    ElectrodeFrame,
+    FeatureEstimate,
+    FieldEstimate,
+    Stamp,
+    SynthesisEstimate,
+    Tare,
+)
 from palpate.process import Closing
 from palpate_services.viewer.layout import MAX_SENSORS, SensorContents
 from palpate_services.viewer.live_view import DrawnPart, LiveView, ViewMessage, ViewPlan
@@ -40,11 +49,18 @@ PERIOD_S = 1.0
 """Time between two parts [s]. Viewers take in a few pieces for each picture that they draw: at
 0.5 s one without a graphics card falls behind for ever."""
 
+SET_BACK_NS = 1_000_000_000
+"""A wall clock that goes back by more than this was set back [ns]; by less, hosts may differ."""
+
+GONE_S = 20.0
+"""A sensor that has sent nothing for so long loses its tab when another one needs it [s]."""
+
 _AGAIN_S = 5.0
 _CLOSE_S = 2.0
 _CAPACITY = 512  # 40 MB if all are fields
 _TURN_S = 0.2
 _FIELDS = frozenset({FIELD.name, FIELD_TRUTH.name})
+_ESTIMATES = (FeatureEstimate, FieldEstimate, SynthesisEstimate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +121,7 @@ class KeptParts:
         with self._lock:
             self._parts.clear()
             self._chapter_bytes.clear()
+            self.contents = {}
 
     def after(self, place: str) -> ViewPart | None:
         """What comes after a place; an empty or unknown one is the beginning. None = nothing yet.
@@ -140,6 +157,10 @@ def _read_place(place: str) -> tuple[str, int, int]:
     return parts[0], int(parts[1]), int(parts[2])
 
 
+def _gone(last_ns: int, now_ns: int) -> bool:
+    return now_ns - last_ns > GONE_S * 1e9
+
+
 class WatchedView(Closing):
     """Has a station drawn while somebody watches. ``next_part`` is for other threads.
 
@@ -160,8 +181,9 @@ class WatchedView(Closing):
         self._chapter = 0
         self._begun_s = float("-inf")
         self._told: set[tuple[str, int]] = set()
-        self._sensors: set[str] = set()
+        self._sensors: dict[str, int] = {}  # when it last sent, monotonic clock [ns]
         self._field_drawn_ns: dict[tuple[str, str], int] = {}
+        self._wall_ns: dict[tuple[str, str], int] = {}
 
     def next_part(self, place: str) -> ViewPart | None:
         """What a viewer draws next; the question says that somebody watches."""
@@ -221,6 +243,9 @@ class WatchedView(Closing):
         self._chapter += 1
         self._begun_s = time.monotonic()
         self._told.clear()
+        now_ns = time.monotonic_ns()
+        self._sensors = {name: ns for name, ns in self._sensors.items() if not _gone(ns, now_ns)}
+        shown = self.parts.contents
         plan = ViewPlan(
             None,
             self._title,
@@ -228,10 +253,10 @@ class WatchedView(Closing):
             self._bundles,
             period_s=PERIOD_S,
             recording_id=self.parts.run,
-            known=self.parts.contents,
+            known={name: shown[name] for name in shown if name in self._sensors},
         )
-        chapter = self._chapter
-        self._view = LiveView(plan, lambda part: self.parts.add(chapter, part))
+        chapter, parts = self._chapter, self.parts
+        self._view = LiveView(plan, lambda part: parts.add(chapter, part))
 
     def _end_chapter(self) -> None:
         if self._view is not None:
@@ -249,16 +274,19 @@ class WatchedView(Closing):
         sample = tap.next(0.0)
         if self._view is None:
             return
+        now_ns = sample.received_monotonic_ns
         if sample.sensor not in self._sensors and len(self._sensors) >= MAX_SENSORS:
             self._counts["view_no_room"] += 1
+            if any(_gone(last_ns, now_ns) for last_ns in self._sensors.values()):
+                self._end_chapter()  # the next one has room
             return
         stream = sample.sensor, sample.topic
         if sample.topic in _FIELDS:
             # Large, and the view leaves out most of them anyway.
             last_ns = self._field_drawn_ns.get(stream, 0)
-            if sample.received_monotonic_ns - last_ns < DRAW_PERIOD_NS:
+            if now_ns - last_ns < DRAW_PERIOD_NS:
                 return
-            self._field_drawn_ns[stream] = sample.received_monotonic_ns
+            self._field_drawn_ns[stream] = now_ns
         topic = TOPICS[sample.topic]
         message = None
         with contextlib.suppress(PalpateError):
@@ -267,12 +295,25 @@ class WatchedView(Closing):
         if message is None:
             self._counts["view_rejected"] += 1
             return
-        self._sensors.add(sample.sensor)
+        self._sensors[sample.sensor] = now_ns
+        if not isinstance(message, Tare) and self._set_back(stream, message):
+            # Viewers stay at the latest time of a recording: they get another one.
+            self._end_chapter()
+            self.parts = KeptParts()
+            self._wall_ns.clear()
+            return
         if isinstance(message, Tare):
             self._told.add((sample.sensor, message.tare_id))
         elif isinstance(message, ElectrodeFrame):
             self._tell_tare(sample.sensor, message.tare_id)
         self._view.offer(ViewMessage(sample.sensor, sample.topic, sample.payload))
+
+    def _set_back(self, stream: tuple[str, str], message: Any) -> bool:
+        """Whether a message was taken long before the last one of its stream, by the wall clock."""
+        stamp: Stamp = message.source if isinstance(message, _ESTIMATES) else message.stamp
+        last_ns = self._wall_ns.get(stream, stamp.wall_ns)
+        self._wall_ns[stream] = stamp.wall_ns
+        return last_ns - stamp.wall_ns > SET_BACK_NS
 
     def _tell_tare(self, sensor: str, tare_id: int) -> None:
         """Hand over the tare that a frame names, once a chapter."""

@@ -138,6 +138,18 @@ def _serving(application: WebApplication, config: WebConfig) -> Iterator[None]:
         that reader liked: four of them held up everybody.
         """
 
+        active_s: float
+        """When something last went in or out, monotonic clock [s]."""
+
+        @property
+        def last_activity(self) -> float:
+            """The same for waitress, by the wall clock as it is set now."""
+            return time.time() - (time.monotonic() - self.active_s)
+
+        @last_activity.setter
+        def last_activity(self, _: float) -> None:
+            self.active_s = time.monotonic()
+
         def service(self) -> None:
             self.requests[0].headers["CONNECTION"] = "close"
             super().service()
@@ -178,7 +190,7 @@ def _serving(application: WebApplication, config: WebConfig) -> Iterator[None]:
             for idle in [
                 one
                 for one in channels.values()
-                if isinstance(one, HTTPChannel) and time.time() - one.last_activity > IDLE_S
+                if isinstance(one, OneAnswer) and time.monotonic() - one.active_s > IDLE_S
             ]:
                 idle.handle_close()
         server.task_dispatcher.shutdown()

@@ -15,6 +15,8 @@ from palpate_deploy.station.troubles import troubles
 
 RECORDER = "recorder"
 
+_WELL = ("ready", "routes", "finished")
+
 PROCESSES_MOST = 64
 """Processes and sensors that a page shows; names come from other processes, and may be invented."""
 
@@ -43,16 +45,18 @@ def snapshot(
         for one in troubles(one.report for one in observed)
         if (one.service, one.instance) != ROUTER
     ]
+    processes = process_activities(observed)
     plain: dict[str, Any] = {
         "station": station,
         "router": router,
         "answers": bool(answering),
+        "well": sum(one.state in _WELL for one in processes),
         "left_out": len(observed) - len(shown),
         "sensors": [
             {**asdict(one), "age_s": ages_s.get(one.gateway)}
             for one in sensor_activities(shown)[:PROCESSES_MOST]
         ],
-        "processes": [asdict(one) for one in process_activities(shown)],
+        "processes": [asdict(one) for one in processes[:PROCESSES_MOST]],
         "recordings": [_recording(one) for one in shown if one.report.service == RECORDER],
         "troubles": [asdict(one) for one in wrong[:PROCESSES_MOST]],
     }

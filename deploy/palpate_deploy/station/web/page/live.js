@@ -3,6 +3,8 @@
 
 const PERIOD_MS = 300;
 const AGAIN_MS = 1000;
+const PART_MS = 60000; // up to 4 MB
+const FILE_MS = 600000; // 14 MB, once
 const CHANNEL = "station";
 
 const say = (text) => {
@@ -12,25 +14,40 @@ const say = (text) => {
 };
 const pause = (time_ms) => new Promise((done) => setTimeout(done, time_ms));
 
+// An answer with all that it holds; null = it did not come, or not whole.
+async function ask(address, patience_ms) {
+  try {
+    const answer = await fetch(address, { signal: AbortSignal.timeout(patience_ms) });
+    return { status: answer.status, headers: answer.headers, data: await answer.arrayBuffer() };
+  } catch {
+    return null;
+  }
+}
+
 // While the station prepares the viewer it answers 503 and says why.
 async function viewerFile(name) {
   for (;;) {
-    const answer = await fetch(`/viewer/${name}`).catch(() => null);
-    if (answer?.ok) return answer;
-    say(answer ? await answer.text() : "The station does not answer.");
+    const answer = await ask(`/viewer/${name}`, FILE_MS);
+    if (answer?.status === 200) return answer.data;
+    say(answer ? new TextDecoder().decode(answer.data) : "The station does not answer.");
     await pause(AGAIN_MS);
   }
 }
 
 async function script(name) {
-  await viewerFile(name);
-  await new Promise((done, failed) => {
-    const element = document.createElement("script");
-    element.src = `/viewer/${name}`;
-    element.onload = done;
-    element.onerror = () => failed(new Error(`${name} cannot be loaded`));
-    document.body.append(element);
-  });
+  for (;;) {
+    await viewerFile(name);
+    const loaded = await new Promise((done) => {
+      const element = document.createElement("script");
+      element.src = `/viewer/${name}`;
+      element.onload = () => done(true);
+      element.onerror = () => done(false);
+      document.body.append(element);
+    });
+    if (loaded) return;
+    say(`${name} cannot be loaded.`);
+    await pause(AGAIN_MS);
+  }
 }
 
 async function start() {
@@ -50,11 +67,10 @@ async function feed(viewer) {
   viewer.open_channel(CHANNEL, CHANNEL);
   say("Waiting for the first picture …");
   while (!viewer.has_panicked()) {
-    const answer = await fetch(`/api/view?after=${encodeURIComponent(place)}`).catch(() => null);
+    const answer = await ask(`/api/view?after=${encodeURIComponent(place)}`, PART_MS);
     if (answer?.status === 200) {
-      const data = new Uint8Array(await answer.arrayBuffer());
       place = answer.headers.get("Palpate-Place");
-      viewer.send_rrd_to_channel(CHANNEL, data);
+      viewer.send_rrd_to_channel(CHANNEL, new Uint8Array(answer.data));
       if (!begun) { begun = true; say(""); }
     } else {
       await pause(answer?.status === 204 ? PERIOD_MS : AGAIN_MS);

@@ -68,10 +68,10 @@ const named = (one) => (one.service === one.instance ? one.service : `${one.serv
 function show(status) {
   at("station").textContent = status.station;
   document.title = `${status.station} – palpate`;
-  const well = status.processes.filter((one) => ["ready", "routes", "finished"].includes(one.state)).length;
+  const all = status.processes.length + status.left_out;
   const whole = at("whole");
   const wrong = status.troubles.length;
-  whole.textContent = `${well} of ${status.processes.length} processes well${wrong ? `, ${wrong} wrong` : ""}`;
+  whole.textContent = `${status.well} of ${all} processes well${wrong ? `, ${wrong} wrong` : ""}${status.left_out ? `, ${status.left_out} not shown` : ""}`;
   whole.className = `word ${wrong ? "bad" : "good"}`;
   at("live").hidden = !status.live;
   const gone = "the router is gone. It starts again by itself, or with: palpate up";
@@ -84,7 +84,7 @@ function show(status) {
     status.sensors.map((one) => [
       one.name, state(one.state), right(duration(one.state_age_s)), right(number(one.rate_hz, 1)), right(`${number(one.age_s, 1)} s`),
       right(ms(one.publish.p50_s)), right(ms(one.publish.p99_s)),
-      one.tare_age_s === null ? { text: "not tared", kind: "number word waiting" } : right(duration(one.tare_age_s)),
+      one.tare_age_s === null && one.tactile ? { text: "not tared", kind: "number word waiting" } : right(duration(one.tare_age_s)),
       right(number(one.tare_drift_counts, 1)), wide(one.message),
     ]), "no gateway tells of a sensor");
 
