@@ -123,13 +123,17 @@ def test_a_process_that_hangs_is_ended(
 
 
 def test_a_process_that_hangs_at_the_end_is_not_waited_for(
-    plan: ViewPlan, message: Callable[[int], ViewMessage], until: Until
+    plan: ViewPlan,
+    message: Callable[[int], ViewMessage],
+    until: Until,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     with drawn(plan, message(1), until) as (view, child):
         os.kill(child, signal.SIGSTOP)
         view.close(0.2)
         assert children_of(os.getpid()) == []
         assert view.take_counts()["view_failed"] == 1
+    assert "it was not done 0.2 s after the record" in caplog.text
 
 
 def test_a_process_that_is_killed_is_reported(

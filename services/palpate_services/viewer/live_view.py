@@ -124,6 +124,7 @@ class LiveView:
         self._waiting_bytes = 0
         self._process: subprocess.Popen[bytes] | None = None
         self._given_up = False
+        self._patience_s: float | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
         self._thread.start()
@@ -162,6 +163,7 @@ class LiveView:
             with self._lock:
                 process = self._process
             if process is not None:
+                self._patience_s = timeout_s
                 process.kill()
                 self.join(timeout_s)
 
@@ -176,6 +178,8 @@ class LiveView:
         except Exception as error:
             # A defect of the picture must be visible in the log, and must not stop the record.
             why = str(error) if isinstance(error, _ViewLost) else repr(error)
+            if self._patience_s is not None:
+                why = f"it was not done {self._patience_s:g} s after the record"
             if self._plan.path is None:
                 _log.warning("the live view is given up: %s", why)
             else:
