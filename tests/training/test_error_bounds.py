@@ -253,7 +253,10 @@ def test_a_bundle_gets_bounds_and_keeps_its_answers(
     assert intervals.data_sha256 == held_out.content_sha256()
     assert [one.name for one in intervals.others] == ["force_magnitude", "force"]
     assert "another" in intervals.others_source
+    # So few presses do not know how the values of an input go together.
+    assert old.known_inputs is not None
     assert new.known_inputs is not None
+    assert new.known_inputs.pattern is old.known_inputs.pattern is None
     found = held_out_features(new, held_out)
     share = covered(
         found.errors["force"],
@@ -265,7 +268,7 @@ def test_a_bundle_gets_bounds_and_keeps_its_answers(
 
 def test_each_other_sensor_counts_once(press_data: MakeData, trained: Path, tmp_path: Path) -> None:
     """Bounds hold for every one that is given: its presses tell nothing of the next sensor."""
-    write_dataset(tmp_path / "held.h5", press_data(presses=40, seed=1))
+    write_dataset(tmp_path / "held.h5", press_data(presses=60, seed=1))
     sensors = [
         replace(press_data(presses=30, seed=2 + k), sensor_names=(f"other-{k}",)) for k in range(2)
     ]
@@ -278,6 +281,7 @@ def test_each_other_sensor_counts_once(press_data: MakeData, trained: Path, tmp_
     new = read_bundle(tmp_path / "2")
     assert new.manifest.intervals is not None
     assert new.known_inputs is not None
+    assert new.known_inputs.pattern is not None
     for sensor in sensors:
         found = held_out_features(new, sensor)
         wide = bounds(new.manifest.intervals.others[0], found.terms(new.known_inputs))
