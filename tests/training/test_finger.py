@@ -160,6 +160,18 @@ def test_intervals_are_told_by_presses_that_did_not_set_them() -> None:
     assert (1.645 * said.force_sd >= 0.99).all(), "the width itself knows all presses"
 
 
+def test_untouched_rows_do_not_make_intervals_of_touched_ones_closer() -> None:
+    rng = np.random.default_rng(0)
+    press = np.repeat(np.arange(40), 100)
+    touched = np.arange(4000) % 2 == 0
+    truth = np.where(touched[:, None], [0.0, 0.0, 2.0], 0.0)
+    wrong = np.where(touched[:, None], rng.normal(0.0, 1.0, (4000, 3)), 1e-3)
+    rows = KnownRows(np.zeros((4000, 19)), truth, press)
+    said = HeldOutPresses.of(truth + wrong, rows, touched, {})
+    assert said.metrics["coverage_90"] == pytest.approx(0.92, abs=0.02)
+    np.testing.assert_allclose(said.force_sd, 1.0, rtol=0.15)
+
+
 def test_what_never_changes_is_refused(press_data: MakeData, tmp_path: Path) -> None:
     data = press_data(presses=8)
     still = replace(data, force=np.full_like(data.force, 2.0))

@@ -202,7 +202,8 @@ class HeldOutPresses:
 
     Attributes:
         metrics: As in the manifest.
-        force_sd: Per axis, so that ``LEVEL`` of the next press's errors lie within 1.645 of it [N].
+        force_sd: Per axis, so that ``LEVEL`` of the errors of touched rows of the next press lie
+            within 1.645 of it [N].
         threshold_n: Below this estimated force there is no contact [N].
         formulas: Bounds of errors.
         presses: How many presses.
@@ -233,20 +234,20 @@ class HeldOutPresses:
             rivals: What other estimators say of these rows, by name.
             follow: How bounds follow a frame; None = as these presses say.
         """
-        force_sd = _force_sd(estimate - known.force, known.press)
         untouched_n = np.linalg.norm(estimate[~touched], axis=1)
         truth, press = known.force[touched], known.press[touched]
+        off = estimate[touched] - truth
         metrics = force_metrics(estimate[touched], truth)
         errors = force_errors(estimate[touched], truth)
         metrics["force_magnitude_p95_n"] = float(np.percentile(errors["magnitude_n"], 95.0))
-        metrics["coverage_90"] = _coverage(estimate - known.force, known.press, touched)
+        metrics["coverage_90"] = _coverage(off, press)
         for name, other in rivals.items():
             found = force_metrics(other[touched], truth)
             for key in ("force_magnitude_median_n", "force_angle_median_rad"):
                 metrics[f"{name}_{key}"] = found[key]
         return cls(
             metrics,
-            force_sd,
+            _force_sd(off, press),
             threshold_above(untouched_n) if len(untouched_n) else TOUCH_N,
             finger_formulas(estimate[touched], truth, press, follow=follow),
             len(np.unique(press)),
@@ -296,8 +297,8 @@ def write_finger(
         metrics=said.metrics,
         normalisation={
             "estimator": estimator,
-            "force_sd": f"{LEVEL:.0%} of the errors on presses held out, axis by axis, are within"
-            f" {_DEVIATIONS:.3f} of it",
+            "force_sd": f"{LEVEL:.0%} of the errors of touched rows of presses held out, axis by"
+            f" axis, are within {_DEVIATIONS:.3f} of it",
             **(normalisation or {}),
         },
         training_range=TrainingRange(
@@ -492,13 +493,13 @@ def full_estimate_of(net: nn.Module, tared: Floats) -> Floats:
         return np.asarray(net(torch.from_numpy(tared)).numpy())
 
 
-def _coverage(errors: Floats, press: Rows, touched: npt.NDArray[np.bool_]) -> float:
-    """Share of the errors of touched rows within intervals that other presses' errors gave."""
+def _coverage(errors: Floats, press: Rows) -> float:
+    """Share of the errors within intervals that other presses' errors gave."""
     within = np.zeros(errors.shape, np.bool_)
     for out in _folds(press, FOLDS):
         force_sd = _force_sd(errors[~out], press[~out])
         within[out] = np.abs(errors[out]) <= _DEVIATIONS * force_sd
-    return float(within[touched].mean())
+    return float(within.mean())
 
 
 def _force_sd(errors: Floats, press: Rows) -> Floats:
