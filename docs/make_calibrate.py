@@ -235,7 +235,7 @@ def real_bounds(data: FeatureDataset, seconds: int, others: list[OtherFinger]) -
     terms = terms_of(size, np.zeros(len(size)), np.zeros(len(size)))
     held = {
         one.name: float(np.mean(error[ERRORS_OF[one.name]] <= bounds(one, terms)))
-        for one in (formulas.formulas if formulas else ())
+        for one in ((formulas.formulas if seconds else formulas.others) if formulas else ())
     }
     return {
         "finger": data.sensor_names[0],

@@ -531,6 +531,8 @@ def test_from_presses_to_estimates(
     with Session.open(link, station="test") as session:
         answer = session.subscriber(FEATURES, sensor="finger").next(20).message
     assert QualityFlag.UNCALIBRATED in answer.quality
+    assert answer.bounds is not None
+    assert answer.bounds.other_sensors
     itself = palpate(
         *("calibrate", "finger", "--presses", "0", "--others", record, "--profile", profile),
         timeout=240,

@@ -24,6 +24,7 @@ from palpate_training.learning.force_process import (
     ForceProcesses,
     KnownRows,
 )
+from palpate_training.learning.intervals import bounds, terms_of
 from palpate_training.learning.told_finger import ToldFinger
 from palpate_training.learning.twin_line import read_line
 from palpate_training.tasks import finger
@@ -158,6 +159,37 @@ def test_intervals_are_told_by_presses_that_did_not_set_them() -> None:
     said = HeldOutPresses.of(force + wrong, rows, np.ones(60, bool), {})
     assert said.metrics["coverage_90"] == pytest.approx(5 / 6)
     assert (1.645 * said.force_sd >= 0.99).all(), "the width itself knows all presses"
+
+
+def test_what_is_said_of_fingers_left_out_holds_on_each() -> None:
+    """Presses of a finger tell nothing of the next one, of which the estimate may know less."""
+    rng = np.random.default_rng(0)
+    number, press = np.repeat(np.arange(3), 400), np.repeat(np.arange(60), 20)
+    force = rng.uniform(4.0, 8.0, 60)[press, None] * np.array([0.0, 0.0, 1.0])
+    wrong = rng.uniform(0.5, 1.0, (1200, 3)) * np.where(number == 1, 1.0, 0.1)[:, None]
+    rows = KnownRows(np.zeros((1200, 19)), force, press)
+    said = HeldOutPresses.of(force + wrong, rows, np.ones(1200, bool), {}, finger=number)
+    assert said.presses == 60
+    assert said.metrics["coverage_90"] == pytest.approx(2 / 3, abs=0.01)
+    worst = number == 1
+    assert (np.mean(np.abs(wrong[worst]) <= 1.645 * said.force_sd, axis=0) >= 0.9).all()
+    nothing = np.zeros(1200)
+    terms = terms_of(np.linalg.norm(force + wrong, axis=1), nothing, nothing)
+    _, vector = said.formulas
+    held = np.linalg.norm(wrong, axis=1) <= bounds(vector, terms)
+    assert 0.9 <= held[worst].mean() < 1.0
+
+
+def test_untouched_rows_do_not_make_intervals_of_touched_ones_closer() -> None:
+    rng = np.random.default_rng(0)
+    press = np.repeat(np.arange(40), 100)
+    touched = np.arange(4000) % 2 == 0
+    truth = np.where(touched[:, None], [0.0, 0.0, 2.0], 0.0)
+    wrong = np.where(touched[:, None], rng.normal(0.0, 1.0, (4000, 3)), 1e-3)
+    rows = KnownRows(np.zeros((4000, 19)), truth, press)
+    said = HeldOutPresses.of(truth + wrong, rows, touched, {})
+    assert said.metrics["coverage_90"] == pytest.approx(0.92, abs=0.02)
+    np.testing.assert_allclose(said.force_sd, 1.0, rtol=0.15)
 
 
 def test_what_never_changes_is_refused(press_data: MakeData, tmp_path: Path) -> None:

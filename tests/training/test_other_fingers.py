@@ -14,6 +14,7 @@ from onnxruntime import InferenceSession
 
 from palpate.errors import DatasetError
 from palpate.files.bundle import read_bundle
+from palpate.files.intervals import bound_terms, bounds_of
 from palpate_training.datasets.features import FeatureDataset, joined
 from palpate_training.datasets.ingest import ingest_lasa
 from palpate_training.evaluation.transfer import fingers_of, first_seconds
@@ -63,6 +64,12 @@ def test_a_finger_is_estimated_before_it_is_pressed(press_data: MakeData, tmp_pa
     assert manifest.sensor_serials == (), "no sensor is taken for calibrated"
     assert manifest.intervals is not None
     assert "too close for another finger" in manifest.intervals.source
+    # A service gives these bounds to a sensor that a bundle was not made for: here to every one.
+    given = bounds_of(manifest.intervals, bound_terms(2.0, 0.0, 0.0), others=True)
+    assert given is not None
+    assert given.other_sensors
+    assert given.force_magnitude is not None
+    assert "too close for another finger" in manifest.intervals.others_source
     session = InferenceSession((tmp_path / "b" / "model.onnx").read_bytes())
     force = session.run(["force"], {"electrodes": new.tared_counts})[0]
     touched = size(new.force) > 1.0
@@ -96,9 +103,11 @@ def test_bounds_of_several_other_fingers_are_those_of_a_finger_left_out(
     ]
     medians = [report.metrics["force_magnitude_median_n"] for report in reports]
     assert medians[1] > 3.0 * medians[0], "how much fingers differ is told"
-    formulas = read_bundle(tmp_path / "0").manifest.intervals
-    assert formulas is not None
-    assert "each finger left out" in formulas.source
+    intervals = read_bundle(tmp_path / "0").manifest.intervals
+    assert intervals is not None
+    assert "each finger left out" in intervals.source
+    assert "each finger left out" in intervals.others_source
+    assert intervals.presses == 24
 
 
 def test_without_other_fingers_nothing_is_written(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from palpate.errors import ConfigError, DatasetError
 from palpate_training.cli import train_app
 from palpate_training.datasets.features import FeatureDataset, write_dataset
 from palpate_training.learning import population_fit
+from palpate_training.learning.intervals import Floats, Labels
 from palpate_training.learning.networks import predict
 from palpate_training.learning.population_fit import PopulationRows
 from palpate_training.learning.population_net import (
@@ -32,7 +34,7 @@ from palpate_training.tasks.population import (
     rows_of,
     train_population,
 )
-from palpate_training.tasks.population_bounds import held_bounds
+from palpate_training.tasks.population_bounds import held_bounds, told_errors
 from palpate_training.tasks.population_errors import SHOTS, draw_shots, shots_table
 
 UNSEEN = "unseen_specimen_unseen_press"
@@ -88,6 +90,31 @@ def test_bounds_hold_on_specimens_that_neither_network_nor_bound_has_met(
     assert (
         held_bounds(net.quantities, predict(net, rows.inputs)[one], rows, one, rows.specimen) == {}
     )
+
+
+def test_pressed_rows_whose_location_is_unknown_do_not_count() -> None:
+    """A simulation may find no contact in a row that has a force."""
+    rng = np.random.default_rng(0)
+    specimen, press = np.repeat(np.arange(4), 100), np.repeat(np.arange(40), 10)
+    truth = np.hstack([np.tile([0.0, 0.0, 1.0], (400, 1)), rng.normal(0.0, 1e-3, (400, 3))])
+    estimate = truth + rng.normal(0.0, 1e-2, (400, 6))
+    quantities = ("force", "contact_location")
+
+    def known(targets: Floats, tested: Labels) -> tuple[dict[str, Any], dict[str, Any]]:
+        nothing = np.zeros((400, 19), np.float32)
+        rows = PopulationRows(nothing, nothing, targets.astype(np.float32), specimen, press)
+        given = (quantities, estimate[tested], rows, tested)
+        return told_errors(*given)["bounds"], held_bounds(*given, specimen)
+
+    unknown = (np.arange(400) % 7 == 0) | (specimen == 3)
+    holes = truth.copy()
+    holes[unknown, 3:] = np.nan
+    told, held = known(holes, np.arange(400))
+    same_told, same_held = known(truth, np.flatnonzero(~unknown))
+    assert told["contact_location"] == same_told["contact_location"]
+    assert held["contact_location"] == same_held["contact_location"]
+    assert held["contact_location"]["specimens"] == 3
+    assert held["force_magnitude"]["specimens"] == 4
 
 
 def test_a_network_is_measured_again_without_a_training(

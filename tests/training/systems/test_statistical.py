@@ -59,3 +59,11 @@ def test_the_same_seed_gives_the_same(make_samples: MakeSamples) -> None:
     for fit in (statistical.fit_mixture, statistical.fit_trees):
         first, second = (fit("force", train, test, 3)(test) for _ in range(2))
         np.testing.assert_array_equal(first, second)
+
+
+def test_trees_of_many_rows_are_the_same_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more than 200,000 rows the library draws some to choose its bins."""
+    monkeypatch.setattr(statistical, "TREES", 1)
+    x = np.random.default_rng(0).normal(size=(200_001, 1))
+    first, second = (statistical.boosted_trees(x, 2.0 * x)(x[:1000]) for _ in range(2))
+    np.testing.assert_array_equal(first, second)

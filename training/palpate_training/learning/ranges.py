@@ -94,7 +94,9 @@ def known_inputs(
     unseen = float(np.quantile(np.concatenate(distances), ACCEPTED)) if distances else 0.0
     # A handful of rows may all be representatives of their own; noise must still be let through.
     known = KnownInputs(every, scale, max(1.001 * radius, unseen, 1e-3))
-    return known if len(names) < PRESSES_OF_PATTERN else with_pattern(known, rows, groups)[0]
+    if len(names) < PRESSES_OF_PATTERN:
+        return known
+    return with_pattern(known, rows, groups, among=True)[0]
 
 
 def with_pattern(
@@ -102,14 +104,25 @@ def with_pattern(
     rows: npt.NDArray[np.floating],
     groups: npt.NDArray[np.integer],
     *,
+    among: bool = False,
     unlike: float = UNLIKE,
     scale: float = PATTERN_SCALE_COUNTS,
     shrink: float = PATTERN_SHRINK,
 ) -> tuple[KnownInputs, npt.NDArray[np.float64]]:
     """The same with a pattern of its representatives and of rows ``(N, I)``.
 
-    ``groups`` names the press of each row. The limit leaves out a share ``unlike`` of the rows of
-    presses that the pattern was made without; each press counts the same.
+    The limit leaves out a share ``unlike`` of the rows of presses that the pattern was made
+    without; each press counts the same.
+
+    Args:
+        known: Representatives of the training rows.
+        rows: Inputs, shape ``(N, I)``.
+        groups: Press of each row, shape ``(N,)``.
+        among: The representatives are some of these rows: each row counts once then, and none is
+            in a pattern that its own press is measured with.
+        unlike: Share of the rows of presses held out that may be flagged.
+        scale: Of the compression of the values, in their unit.
+        shrink: Added to the variance of each combination, over that of one term.
 
     Returns:
         What is known then, and how strange each row is without its press, over the limit.
@@ -121,7 +134,7 @@ def with_pattern(
         np.isin(groups, part) for part in np.array_split(names, min(_PATTERN_FOLDS, len(names)))
     ]
     parts = [_products(rows[out], scale, origin) for out in held]
-    every = _products(whole, scale, origin) + sum(parts)
+    every = sum(parts) if among else _products(whole, scale, origin) + sum(parts)
     strange = np.zeros(len(rows))
     for out, part in zip(held, parts, strict=True):
         strange[out] = strangeness(_pattern(every - part, scale, origin, shrink), rows[out])

@@ -202,7 +202,8 @@ class HeldOutPresses:
 
     Attributes:
         metrics: As in the manifest.
-        force_sd: Per axis, so that ``LEVEL`` of the next press's errors lie within 1.645 of it [N].
+        force_sd: Per axis, so that ``LEVEL`` of the errors of touched rows of the next press lie
+            within 1.645 of it [N].
         threshold_n: Below this estimated force there is no contact [N].
         formulas: Bounds of errors.
         presses: How many presses.
@@ -223,8 +224,12 @@ class HeldOutPresses:
         rivals: Mapping[str, Floats],
         *,
         follow: BoundFormula | None = None,
+        finger: Rows | None = None,
     ) -> HeldOutPresses:
         """From estimates of presses, each made without that press.
+
+        Where whole fingers were left out, what is said holds on the worst of them: presses of one
+        are alike, and tell nothing of the next finger.
 
         Args:
             estimate: Forces [N], shape ``(N, 3)``.
@@ -232,23 +237,25 @@ class HeldOutPresses:
             touched: Which of them are touched, shape ``(N,)``.
             rivals: What other estimators say of these rows, by name.
             follow: How bounds follow a frame; None = as these presses say.
+            finger: Finger of each row, shape ``(N,)``, where whole fingers were left out.
         """
-        force_sd = _force_sd(estimate - known.force, known.press)
         untouched_n = np.linalg.norm(estimate[~touched], axis=1)
         truth, press = known.force[touched], known.press[touched]
+        finger = np.zeros_like(press) if finger is None else finger[touched]
+        off = estimate[touched] - truth
         metrics = force_metrics(estimate[touched], truth)
         errors = force_errors(estimate[touched], truth)
         metrics["force_magnitude_p95_n"] = float(np.percentile(errors["magnitude_n"], 95.0))
-        metrics["coverage_90"] = _coverage(estimate - known.force, known.press, touched)
+        metrics["coverage_90"] = _coverage(off, press, finger)
         for name, other in rivals.items():
             found = force_metrics(other[touched], truth)
             for key in ("force_magnitude_median_n", "force_angle_median_rad"):
                 metrics[f"{name}_{key}"] = found[key]
         return cls(
             metrics,
-            force_sd,
+            _force_sd(off, press, finger),
             threshold_above(untouched_n) if len(untouched_n) else TOUCH_N,
-            finger_formulas(estimate[touched], truth, press, follow=follow),
+            finger_formulas(estimate[touched], truth, press, follow=follow, finger=finger),
             len(np.unique(press)),
         )
 
@@ -263,6 +270,7 @@ def write_finger(
     source: str,
     held_out_as: str,
     data_sha256: str,
+    foreign: bool = False,
     contact_sd: Mapping[str, npt.NDArray[np.float32]] | None = None,
     normalisation: Mapping[str, str] | None = None,
     **described: Any,
@@ -278,6 +286,8 @@ def write_finger(
         source: Of the rows, for people.
         held_out_as: How presses were held out, for people.
         data_sha256: Content of what was learned from.
+        foreign: The rows are of other fingers than the one that it is for. What is said is then
+            said of sensors that it was not made for, too.
         contact_sd: As ``FeaturesGraph`` takes it.
         normalisation: More words for the manifest.
         described: Name, version and so on for the manifest, as ``export_features`` takes them.
@@ -296,8 +306,8 @@ def write_finger(
         metrics=said.metrics,
         normalisation={
             "estimator": estimator,
-            "force_sd": f"{LEVEL:.0%} of the errors on presses held out, axis by axis, are within"
-            f" {_DEVIATIONS:.3f} of it",
+            "force_sd": f"{LEVEL:.0%} of the errors of touched rows of presses held out, axis by"
+            f" axis, are within {_DEVIATIONS:.3f} of it",
             **(normalisation or {}),
         },
         training_range=TrainingRange(
@@ -309,7 +319,15 @@ def write_finger(
             combinations=True,
         ),
         known_inputs=known_inputs(rows.tared.astype(np.float32), rows.press),
-        intervals=Intervals(LEVEL, bounds_of, data_sha256, said.presses, said.formulas)
+        intervals=Intervals(
+            LEVEL,
+            bounds_of,
+            data_sha256,
+            said.presses,
+            said.formulas,
+            said.formulas if foreign else (),
+            bounds_of if foreign else "",
+        )
         if said.formulas
         else None,
         **described,
@@ -321,7 +339,12 @@ STEPS = FOLDS + 1
 
 
 def finger_formulas(
-    held_out: Floats, force: Floats, press: Rows, *, follow: BoundFormula | None = None
+    held_out: Floats,
+    force: Floats,
+    press: Rows,
+    *,
+    follow: BoundFormula | None = None,
+    finger: Rows | None = None,
 ) -> tuple[BoundFormula, ...]:
     """Bounds of the errors of the next press; none that lies beyond every force of the presses.
 
@@ -330,6 +353,7 @@ def finger_formulas(
         force: The true ones.
         press: Press of each row, shape ``(N,)``.
         follow: How bounds follow a frame; None = as these presses say.
+        finger: Finger of each row, shape ``(N,)``: bounds hold on each; None = there is one.
     """
     found = force_errors(held_out, force)
     size = np.linalg.norm(held_out, axis=1)
@@ -349,6 +373,17 @@ def finger_formulas(
             press,
             level=LEVEL,
             use=OF_FINGER if len(np.unique(press)) >= PRESSES_SLOPE else OF_FEW,
+        )
+    if finger is not None and len(names := np.unique(finger)) > 1:
+        formulas = tuple(
+            max(
+                (
+                    widened(one, one.name, errors[one.name][own], terms[own], press[own])
+                    for own in (finger == name for name in names)
+                ),
+                key=lambda wide: wide.weights[0],
+            )
+            for one in formulas
         )
     # Of a few presses that are unlike one another it comes out as hundreds of newtons: unknown.
     strongest_n = np.linalg.norm(force, axis=1).max()
@@ -492,20 +527,25 @@ def full_estimate_of(net: nn.Module, tared: Floats) -> Floats:
         return np.asarray(net(torch.from_numpy(tared)).numpy())
 
 
-def _coverage(errors: Floats, press: Rows, touched: npt.NDArray[np.bool_]) -> float:
-    """Share of the errors of touched rows within intervals that other presses' errors gave."""
+def _coverage(errors: Floats, press: Rows, finger: Rows) -> float:
+    """Share of the errors within intervals that errors of other fingers, or presses, gave."""
     within = np.zeros(errors.shape, np.bool_)
-    for out in _folds(press, FOLDS):
-        force_sd = _force_sd(errors[~out], press[~out])
+    fingers = len(np.unique(finger))
+    for out in _folds(press, FOLDS) if fingers == 1 else _folds(finger, fingers):
+        force_sd = _force_sd(errors[~out], press[~out], finger[~out])
         within[out] = np.abs(errors[out]) <= _DEVIATIONS * force_sd
-    return float(within[touched].mean())
+    return float(within.mean())
 
 
-def _force_sd(errors: Floats, press: Rows) -> Floats:
+def _force_sd(errors: Floats, press: Rows, finger: Rows) -> Floats:
     """Per axis, so that ``LEVEL`` of the errors of the next press lie within 1.645 of it [N].
 
-    Of few presses a larger share is taken: the next one is one more (conformal prediction).
+    Of few presses a larger share is taken: the next one is one more (conformal prediction). Of
+    several fingers it is that of the worst.
     """
-    presses = len(np.unique(press))
-    level = min(1.0, LEVEL * (presses + 1) / presses)
-    return np.asarray(np.quantile(np.abs(errors), level, axis=0) / _DEVIATIONS)
+    found = []
+    for own in (finger == name for name in np.unique(finger)):
+        presses = len(np.unique(press[own]))
+        level = min(1.0, LEVEL * (presses + 1) / presses)
+        found.append(np.quantile(np.abs(errors[own]), level, axis=0))
+    return np.asarray(np.max(found, axis=0) / _DEVIATIONS)

@@ -1,8 +1,8 @@
 """A bundle with bounds of its errors, from presses that its training has not seen.
 
-The weights stay what they are, so do its answers and its metrics. From the held-out presses it also
-learns how the values of an input go together: what is known is then what it was trained on and what
-it was measured with.
+The weights stay what they are, so do its answers and its metrics. From the held-out presses, if
+there are enough, it also learns how the values of an input go together: what is known is then what
+it was trained on and what it was measured with.
 """
 
 from __future__ import annotations
@@ -33,7 +33,13 @@ from palpate_training.learning.export import refuse_existing, version_of
 from palpate_training.learning.field_code import in_parts
 from palpate_training.learning.intervals import LEVEL, fit_formulas, terms_of
 from palpate_training.learning.metrics import field_errors, force_errors, join, location_errors
-from palpate_training.learning.ranges import UNLIKE, holds_known, places_of, with_pattern
+from palpate_training.learning.ranges import (
+    PRESSES_OF_PATTERN,
+    UNLIKE,
+    holds_known,
+    places_of,
+    with_pattern,
+)
 from palpate_training.tasks.evaluate import answers_of, learned_from, read_features
 from palpate_training.tasks.fields import tared_counts
 
@@ -136,7 +142,8 @@ def add_intervals(
         out: Folder to write; must not exist. A number is the version.
         others: Data sets of features of sensors that the bundle was not made for. Recordings of one
             sensor, by its name, count once.
-        unlike: Share of the rows held out that may be flagged by how their values go together.
+        unlike: Share of the rows held out that may be flagged by how their values go together. Of
+            fewer presses than ``PRESSES_OF_PATTERN`` the known inputs stay as they are.
 
     Raises:
         BundleError: It breaks its contract, knows no training rows, or ``out`` exists.
@@ -178,7 +185,9 @@ def add_intervals(
             f"{', '.join(map(str, held_out))}: {presses} presses, {PRESSES_LEAST} are needed",
             remedy="record or simulate more",
         )
-    known, strange = with_pattern(bundle.known_inputs, found.tared, found.press, unlike=unlike)
+    known, strange = bundle.known_inputs, None
+    if presses >= PRESSES_OF_PATTERN:
+        known, strange = with_pattern(known, found.tared, found.press, unlike=unlike)
     formulas = fit_formulas(found.errors, found.terms(known, strange), found.press)
     other, other_source = _of_others(known, sensors)
     intervals = Intervals(

@@ -2,7 +2,7 @@
 
 It is right as far as the finger is like the others, which nobody knows before it is pressed. So it
 names no sensor: every estimate of it is flagged ``UNCALIBRATED``. Its errors and bounds are those
-on a finger that was left out.
+on fingers that were left out, and its bounds are for sensors that it was not made for.
 """
 
 from __future__ import annotations
@@ -92,8 +92,13 @@ def train_unpressed(
         *(np.concatenate([getattr(one, name) for one in rows]) for name in KnownRows.__slots__)
     )
     touched = np.concatenate([tested.touched for _, tested in left_out])
+    number = np.repeat(np.arange(len(rows)), [len(one) for one in rows])
     said = HeldOutPresses.of(
-        np.vstack(estimates), tested_rows, touched, {"constant": np.vstack(constants)}
+        np.vstack(estimates),
+        tested_rows,
+        touched,
+        {"constant": np.vstack(constants)},
+        finger=number if len(others) > 1 else None,
     )
     digest = hashlib.sha256()
     for one in others:
@@ -111,6 +116,7 @@ def train_unpressed(
         if len(others) > 1
         else "one half estimated by the other, so too close for another finger",
         data_sha256=digest.hexdigest(),
+        foreign=True,
         name=name,
         version=version,
         trained_on=f"presses of {names}; of the finger itself none",

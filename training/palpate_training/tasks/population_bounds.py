@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate.files.intervals import TERMS
-from palpate_training.learning.intervals import bounds, covered, fit_formula, terms_of
+from palpate_training.learning.intervals import bounds, covered, fit_formula, fit_formulas, terms_of
 from palpate_training.learning.metrics import (
     angles,
     force_errors,
@@ -53,20 +53,24 @@ def held_bounds(
     Returns:
         By name of the bound: ``held``, share of the errors within it; ``ci95`` of that, by
         specimen; ``worst``, of a specimen; ``bound`` and ``error``, medians [N or m], and the
-        number of ``specimens``. Empty where there are not two.
+        number of ``specimens``. Rows without a known error do not count; a bound is left out where
+        there are not two specimens.
     """
-    errors, terms, press = _bounded(quantities, estimate, rows, tested)
-    specimen = rows.specimen[tested]
+    errors, *every = _bounded(quantities, estimate, rows, tested)
+    every += rows.specimen[tested], fingertip[tested]
     found: dict[str, Any] = {}
-    for name, error in errors.items():
+    for name, values in errors.items():
+        known = ~np.isnan(values)
+        error = values[known]
+        terms, press, specimen, tip = (one[known] for one in every)
         bound = np.full(len(error), np.nan)
-        for learned, other in _halves(specimen, fingertip[tested]):
+        for learned, other in _halves(specimen, tip):
             formula = fit_formula(
                 name, error[learned], terms[learned], press[learned], use=FOLLOWED
             )
             bound[other] = bounds(formula, terms[other])
-        if np.isnan(bound).any():
-            return {}
+        if not known.any() or np.isnan(bound).any():
+            continue
         own = [specimen == one for one in np.unique(specimen)]
         share = np.array([covered(error[one], bound[one], press[one]) for one in own])
         drawn = np.random.default_rng(0).choice(share, (DRAWS, len(share))).mean(axis=1)
@@ -97,7 +101,7 @@ def told_errors(
 
     Returns:
         ``sd`` by quantity: root mean square errors per axis, of a normal that of its angle;
-        ``bounds``: weights of ``TERMS`` by name.
+        ``bounds``: weights of ``TERMS`` by name. Rows without a known error do not count.
     """
     truth = rows.targets[tested]
     spread = {}
@@ -108,11 +112,8 @@ def told_errors(
         error = angles(guess, right)[:, None] if name == "contact_normal" else guess - right
         spread[name] = [float(f"{one:.6g}") for one in rms(error)]
     errors, terms, press = _bounded(quantities, estimate, rows, tested)
-    formulas = {
-        name: fit_formula(name, error, terms, press, use=FOLLOWED).weights
-        for name, error in errors.items()
-    }
-    return {"sd": spread, "bounds": formulas}
+    formulas = fit_formulas(errors, terms, press, use=FOLLOWED)
+    return {"sd": spread, "bounds": {one.name: one.weights for one in formulas}}
 
 
 def _bounded(
@@ -121,7 +122,10 @@ def _bounded(
     rows: PopulationRows,
     tested: Labels,
 ) -> tuple[dict[str, Floats], Floats, Labels]:
-    """Errors that have a bound, by name, the terms of each row, and its press of its specimen."""
+    """Errors that have a bound, by name, the terms of each row, and its press of its specimen.
+
+    Where a row has no contact, its error of the location is NaN.
+    """
     truth = rows.targets[tested]
     both = np.stack([rows.specimen[tested], rows.press[tested]])
     press = np.unique(both, axis=1, return_inverse=True)[1]
