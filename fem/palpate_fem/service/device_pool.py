@@ -387,7 +387,8 @@ class DevicePool(Closing):
                 process.send(ResultTaken())
                 self._pause_s = PAUSE_S
                 self._typical_s += 0.3 * (result.seconds - self._typical_s)
-                self._finish(self._taken(process, number), JobEnded.of(result))
+                task = self._taken(process, number)
+                self._finish(task, self._ended(task, JobEnded.of(result)))
             case PressRefused(number, failed):
                 self._finish(self._taken(process, number), failed)
             case PressUnsolved(number):
