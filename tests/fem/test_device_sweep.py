@@ -276,14 +276,27 @@ def test_what_the_only_device_had_last_is_not_forgotten() -> None:
     assert (report.outcomes["complete"], report.done, len(kept)) == (7, 7, 7)
 
 
+@pytest.mark.parametrize("devices", [1, 2])
+def test_one_that_ends_devices_costs_itself_only(devices: int) -> None:
+    """It goes to the CPU in the end, which it ends, too; those beside it are solved."""
+    (one,) = sweeps.plans(1)
+    poison = PlannedPath("a/poison/path", one.indenter, one.path)
+    plans = short(20)  # too short to do any harm
+    plans[1:1] = [poison]
+    report, _ = run(batch_of(fakes.DIES, devices=devices), plans)
+    assert (report.outcomes["complete"], report.failed) == (20, 1)
+    assert report.early[0].name == poison.name
+    assert "exit status 7" in report.early[0].reason
+
+
 @pytest.mark.parametrize(
     ("kind", "said"),
     [("DIES", "exit status 7, again"), ("STUBBORN", "silent"), ("DEFECTIVE", "a defect")],
 )
 def test_a_solver_that_dies_again_ends_the_batch(kind: str, said: str) -> None:
-    batch = batch_of(getattr(fakes, kind), start_s=20.0, hang_s=2.0 if kind == "STUBBORN" else 20.0)
+    batch = batch_of(getattr(fakes, kind), start_s=60.0, hang_s=2.0 if kind == "STUBBORN" else 20.0)
     with pytest.raises(RemoteError, match=said):
-        run(batch, sweeps.plans(2))
+        run(batch, sweeps.plans(20))
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from palpate.rigid import path_lengths
 from palpate_fem.arrays import Floats
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.result import IndentationOutcome, IndentationStep
+from palpate_fem.service.device_batch import LOSSES_MOST
 from palpate_fem.service.device_process import HANG_S, START_S, DeviceProcess
 from palpate_fem.service.jobs import (
     DeviceEvent,
@@ -60,10 +61,6 @@ SAME = 1e-2
 PAUSE_S = 1.0
 """Time after which a device's process is started again [s]; doubled each time until one solves a
 trajectory."""
-
-LOSSES_MOST = 2
-"""Processes of a device that end with a job on them; then workers solve it: it may be what ends
-them."""
 
 _LONGEST_PAUSE_S = 300.0
 _LEAST_FORCE_N = 0.01
