@@ -39,6 +39,7 @@ from palpate_fem.service.device_pool import DevicePool
 from palpate_fem.service.device_process import wanted_device
 from palpate_fem.service.fingertips import skin_of
 from palpate_fem.service.jobs import (
+    DeviceEvent,
     DeviceReady,
     JobEnded,
     JobEvent,
@@ -378,7 +379,7 @@ class HandDevice:
     def __init__(self, _: object, __: int, on_event: Callable[..., None], **___: float) -> None:
         self.open: dict[int, Any] = {}
         self.ready, self.hung, self.pid = False, False, 0
-        self.tells = lambda event: on_event(self, event)
+        self.tells: Callable[[DeviceEvent | None], None] = lambda event: on_event(self, event)
 
     def give(self, press: NumberedPress, owner: Any) -> None:
         self.open[press.number] = owner

@@ -497,7 +497,8 @@ def test_a_process_that_cannot_be_heard_is_not_waited_for(
 
 def test_a_process_for_which_there_is_no_thread_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is refused like one for which there is no memory: who starts it tries again later."""
-    start, popen, made = threading.Thread.start, subprocess.Popen, []
+    start, popen = threading.Thread.start, subprocess.Popen
+    made: list[Any] = []
 
     def refuse(thread: threading.Thread) -> None:
         if thread.name.startswith("child"):

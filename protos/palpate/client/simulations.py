@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.bus import Session, endpoints
 from palpate.bus.topics import duty_root
@@ -27,7 +28,6 @@ from palpate.errors import (
     WireError,
 )
 from palpate.messages import (
-    FloatArray,
     Pose,
     SimulationCancelRequest,
     SimulationProgress,
@@ -180,7 +180,7 @@ class _StepsOnce:
 
     def __init__(self, on_step: OnStep | None) -> None:
         self._on_step = on_step
-        self._told: list[FloatArray] = []  # their forces [N], each of shape (3,)
+        self._told: list[NDArray[np.float64]] = []  # their forces [N], each of shape (3,)
         self._mesh = b""
 
     def watch(self, parts: Iterable[SimulationReply]) -> Iterator[SimulationReply]:
