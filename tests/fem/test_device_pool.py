@@ -31,7 +31,7 @@ from palpate.messages import (
 from palpate_fem.cli.app import fem_app
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
-from palpate_fem.result import IndentationOutcome
+from palpate_fem.result import IndentationOutcome, IndentationResult
 from palpate_fem.service import device_pool, node
 from palpate_fem.service.biotac import biotac
 from palpate_fem.service.config import FemConfig
@@ -39,11 +39,16 @@ from palpate_fem.service.device_pool import DevicePool
 from palpate_fem.service.device_process import wanted_device
 from palpate_fem.service.fingertips import skin_of
 from palpate_fem.service.jobs import (
+    DeviceEvent,
+    DeviceReady,
     JobEnded,
     JobEvent,
     JobFailed,
     JobStarted,
     JobWaiting,
+    NumberedPress,
+    PressEnded,
+    PressStep,
     SimulationJob,
     StepConverged,
     WorkerSetup,
@@ -366,6 +371,69 @@ def test_a_cancel_is_not_lost_while_the_device_takes_jobs_back(
         end, steps = ended(asked[name])
         assert isinstance(end, JobEnded)
         assert (end.outcome, steps < 30) == (IndentationOutcome.CANCELLED, True)
+
+
+class HandDevice:
+    """The process of a device, of which the test says what it does."""
+
+    def __init__(self, _: object, __: int, on_event: Callable[..., None], **___: float) -> None:
+        self.open: dict[int, Any] = {}
+        self.ready, self.hung, self.pid = False, False, 0
+        self.tells: Callable[[DeviceEvent | None], None] = lambda event: on_event(self, event)
+
+    def give(self, press: NumberedPress, owner: Any) -> None:
+        self.open[press.number] = owner
+
+    def send(self, message: object) -> None:
+        return
+
+    def end_if_hung(self) -> None:
+        return
+
+    def why_it_ended(self) -> str:
+        return "was lost"
+
+    kill = join = end_if_hung
+
+
+def test_no_job_ends_before_the_last_step_that_was_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its first device is lost after two steps; the next one stops before it has made them anew."""
+    devices: list[HandDevice] = []
+
+    def start(*words: Any, **more: Any) -> HandDevice:
+        devices.append(HandDevice(*words, **more))
+        return devices[-1]
+
+    monkeypatch.setattr(device_pool, "DeviceProcess", start)
+    monkeypatch.setattr(device_pool, "PAUSE_S", 0.01)
+    tip = fakes.FakeTip(FingertipParameters(friction_coefficient=fakes.QUICK), 8)
+
+    def gets_ready(number: int) -> None:
+        until(lambda: len(devices) > number)
+        devices[number].tells(JobStarted(tip.describe()))
+        devices[number].tells(DeviceReady())
+
+    with pool_of(fakes.QUICK, options={"fill_s": 600.0}) as pool:  # workers are not ready
+        gets_ready(0)
+        await_ready(pool)
+        events = submit(pool, "stopped", fakes.QUICK)
+        until(lambda: devices[0].open)
+        (number, task), *_ = devices[0].open.items()
+        run = tip.run("sphere_medium", task.job.path, fakes.QUICK, None)
+        for _ in range(2):
+            devices[0].tells(PressStep(number, next(run)))
+        devices[0].tells(None)
+        gets_ready(1)
+        until(lambda: devices[1].open)
+        (number,) = devices[1].open
+        nothing = IndentationResult(
+            "sphere_medium", task.job.path, (), IndentationOutcome.DEADLINE, "too late"
+        )
+        devices[1].tells(PressEnded(number, nothing))
+        end, steps = ended(events)
+        assert isinstance(end, JobEnded)
+        assert (end.outcome, steps) == (IndentationOutcome.DEADLINE, 2)
+        assert end.travel_m == pytest.approx(0.002)
 
 
 def test_workers_solve_what_indenters_the_device_lacks() -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import os
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -28,14 +30,15 @@ from palpate_fem.cli.run import show_report
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.catalogue import make_indenter
 from palpate_fem.result import IndentationOutcome, IndentationResult
-from palpate_fem.service import device_batch
+from palpate_fem.service import channel, device_batch
+from palpate_fem.service import packing as packing_module
 from palpate_fem.service.batch import (
     BatchReport,
     SimulationBatch,
     allow_open_files,
     sweep_into_store,
 )
-from palpate_fem.service.channel import Channel, Outbox
+from palpate_fem.service.channel import Channel, ChildProcess, Outbox
 from palpate_fem.service.device_batch import DeviceBatch, threads_and_packers
 from palpate_fem.service.device_process import check_devices
 from palpate_fem.service.fingertips import skin_of
@@ -273,14 +276,27 @@ def test_what_the_only_device_had_last_is_not_forgotten() -> None:
     assert (report.outcomes["complete"], report.done, len(kept)) == (7, 7, 7)
 
 
+@pytest.mark.parametrize("devices", [1, 2])
+def test_one_that_ends_devices_costs_itself_only(devices: int) -> None:
+    """It goes to the CPU in the end, which it ends, too; those beside it are solved."""
+    (one,) = sweeps.plans(1)
+    poison = PlannedPath("a/poison/path", one.indenter, one.path)
+    plans = short(20)  # too short to do any harm
+    plans[1:1] = [poison]
+    report, _ = run(batch_of(fakes.DIES, devices=devices), plans)
+    assert (report.outcomes["complete"], report.failed) == (20, 1)
+    assert report.early[0].name == poison.name
+    assert "exit status 7" in report.early[0].reason
+
+
 @pytest.mark.parametrize(
     ("kind", "said"),
     [("DIES", "exit status 7, again"), ("STUBBORN", "silent"), ("DEFECTIVE", "a defect")],
 )
 def test_a_solver_that_dies_again_ends_the_batch(kind: str, said: str) -> None:
-    batch = batch_of(getattr(fakes, kind), start_s=20.0, hang_s=2.0 if kind == "STUBBORN" else 20.0)
+    batch = batch_of(getattr(fakes, kind), start_s=60.0, hang_s=2.0 if kind == "STUBBORN" else 20.0)
     with pytest.raises(RemoteError, match=said):
-        run(batch, sweeps.plans(2))
+        run(batch, sweeps.plans(20))
 
 
 @pytest.mark.parametrize(
@@ -428,6 +444,82 @@ def test_files_are_the_same_whoever_packs_them(tmp_path: Path, killed: int) -> N
         np.testing.assert_array_equal(
             found.steps[1].displacement, result.steps[1].displacement.astype(np.float32)
         )
+
+
+def pack_all(path: Path, then: Callable[[PackingProcesses], None] = lambda _: None) -> None:
+    """Six trajectories through two processes; ``then`` is called when two have been given."""
+    tip = fakes.FakeTip(FingertipParameters(), 4000).describe()
+
+    def pack() -> None:
+        with StoreWriter(path, tip) as store, PackingProcesses(store.images, 2) as packing:
+            for number, (name, result) in enumerate(results(6)):
+                packing.put(store.claim(name), result)
+                if number == 1:
+                    then(packing)
+            packing.finish()
+
+    thread = threading.Thread(target=pack, daemon=True)
+    thread.start()
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive(), "it waits without end"
+    assert SimulationStore.open(path).check() == 6
+
+
+def test_a_process_that_packs_and_stands_still_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(packing_module, "HANG_S", 2.0)
+    pack_all(tmp_path / "a.sim", lambda packing: os.kill(packing.pids[0], signal.SIGSTOP))
+
+
+def test_a_process_that_cannot_be_sent_anything_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Descriptors have run out in this process."""
+
+    def refuse(_: object) -> int:
+        raise OSError(errno.EMFILE, "too many open files")
+
+    pack_all(tmp_path / "a.sim", lambda _: monkeypatch.setattr(channel, "_shared", refuse))
+
+
+def test_a_process_that_cannot_be_heard_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Memory has run out in this process."""
+
+    def refuse(_: object) -> object:
+        raise MemoryError
+
+    monkeypatch.setattr(Channel, "receive", refuse)
+    pack_all(tmp_path / "a.sim")
+
+
+def test_a_process_for_which_there_is_no_thread_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is refused like one for which there is no memory: who starts it tries again later."""
+    start, popen = threading.Thread.start, subprocess.Popen
+    made: list[Any] = []
+
+    def refuse(thread: threading.Thread) -> None:
+        if thread.name.startswith("child"):
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    def noted(*words: Any, **more: Any) -> Any:
+        made.append(popen(*words, **more))
+        return made[-1]
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    monkeypatch.setattr(subprocess, "Popen", noted)
+    with pytest.raises(OSError, match="no thread"):
+        ChildProcess(
+            "palpate_fem.service.packing",
+            None,
+            threads=1,
+            on_message=lambda *_: None,
+            on_gone=lambda _: None,
+        )
+    assert made[0].returncode is not None
 
 
 def test_a_full_disk_ends_the_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

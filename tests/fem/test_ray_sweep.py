@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from typer.testing import CliRunner, Result
@@ -21,7 +22,8 @@ from palpate_fem.cli.app import fem_app
 from palpate_fem.config import FingertipParameters
 from palpate_fem.service import ray_batch
 from palpate_fem.service.batch import BatchReport, SimulationBatch, sweep_into_store
-from palpate_fem.service.jobs import WorkerSetup
+from palpate_fem.service.jobs import PressUnsolved, WorkerSetup
+from palpate_fem.service.ray_actor import _Gone
 from palpate_fem.service.ray_batch import RayBatch
 from palpate_fem.store.read import SimulationStore
 
@@ -242,6 +244,82 @@ def test_solvers_that_do_not_work_end_the_batch(
     batch = batch_of(cluster, getattr(fakes, kind), device, **more)
     with pytest.raises(RemoteError, match=said):
         run(batch, sweeps.plans(2))
+
+
+class GpuCluster:
+    """A cluster that has only the number of its GPUs; what it is asked comes to nothing."""
+
+    def __init__(self, gpus: int) -> None:
+        self.gpus, self.ray = gpus, MagicMock()
+        self.ray.exceptions.RayError = RuntimeError
+        start = self.ray.remote.return_value.options.return_value.remote
+        start.side_effect = lambda *_: MagicMock(**{"events.remote.side_effect": lambda: object()})
+        self.ray.wait = lambda wanted, **_: (self.answered & {*wanted}, [])
+        self.answered: set[Any] = set()
+
+    def count(self, what: str) -> int:
+        return self.gpus
+
+
+def idle_batch(gpus: int) -> tuple[RayBatch, GpuCluster]:
+    cluster: Any = GpuCluster(gpus)
+    batch = RayBatch(
+        cluster, WorkerSetup("", {}, FingertipParameters(), 1), device="cuda", look_s=0
+    )
+    batch._next()
+    assert len(batch._devices) == gpus
+    return batch, cluster
+
+
+def answer(batch: RayBatch, cluster: GpuCluster, devices: list[Any], answers: Any) -> None:
+    """Ray has the answers of some actors."""
+    cluster.ray.get = MagicMock(side_effect=answers)
+    for device in devices:
+        cluster.answered = {device.answer}
+        batch._next()
+    cluster.answered = set()
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_machine_that_was_lost_early_gets_all_its_actors_again(silent: bool) -> None:
+    """However often, and although it had not solved anything."""
+    batch, cluster = idle_batch(16)
+    for _ in range(3):
+        lost = batch._devices[8:]
+        answer(batch, cluster, lost, [[]] * 8)  # placed; its kernels are being compiled
+        cluster.gpus = 8
+        if silent:
+            for device in lost:
+                device._turns.next(-1.0)
+                batch._next()
+        else:
+            answer(batch, cluster, lost, RuntimeError("the node died"))
+        assert len(batch._devices) == 8
+        cluster.gpus = 16
+        batch._next()
+        assert len(batch._devices) == 16
+
+
+def test_a_gpu_on_which_nothing_works_is_left_out() -> None:
+    """Its machine is there; it is tried again when another GPU solves for the first time."""
+    batch, cluster = idle_batch(2)
+    (good, _) = batch._devices
+
+    def solves(number: int) -> None:
+        good.open[number] = sweeps.plans(1)[0]
+        answer(batch, cluster, [good], [[PressUnsolved(number)]])
+        batch._next()
+
+    for number in (0, 1):
+        for _ in range(2):
+            assert len(batch._devices) == 2
+            bad = batch._devices[1]
+            answer(batch, cluster, [bad], [[]])
+            answer(batch, cluster, [bad], [[_Gone("the GPU is broken")]])
+            batch._next()
+        assert batch._devices == [good]
+        solves(number)
+    assert batch._devices == [good], "no more than once"
 
 
 def test_a_cluster_without_gpus_is_refused(cluster: RayCluster) -> None:

@@ -303,8 +303,9 @@ def test_services_of_one_name_answer_for_their_own_sensors(own_bus: LinkConfig) 
 def test_many_may_ask_in_the_same_instant(
     own_bus: LinkConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """More than a queue of the bus holds by itself: as many as the service says may wait."""
-    waiting, held = 40, threading.Event()
+    """More than a queue of the bus holds by itself: as many as may run and wait."""
+    values = {"waiting": 20, "workers": 3, "slots": 1}
+    count, held = 23, threading.Event()
     answer = node.SimulationService.simulate
 
     def slow(self: Any, *arguments: Any) -> None:
@@ -321,9 +322,9 @@ def test_many_may_ask_in_the_same_instant(
         except PalpateError as error:
             ends.append(str(error))
 
-    with thread(own_bus, "one", waiting=waiting), Client(own_bus.connect[0], timeout_s=20) as robot:
-        until(lambda: any(one.instance == "one" and one.ready for one in robot.alive()))
-        threads = [threading.Thread(target=ask, args=(robot, k)) for k in range(waiting)]
+    with thread(own_bus, "one", **values), Client(own_bus.connect[0], timeout_s=20) as robot:
+        until(lambda: [one.gauges.get("ready_workers") for one in robot.status()] == [3])
+        threads = [threading.Thread(target=ask, args=(robot, k)) for k in range(count)]
         for each in threads:
             each.start()
         time.sleep(2.0)
@@ -331,7 +332,7 @@ def test_many_may_ask_in_the_same_instant(
         held.set()
         for each in threads:
             each.join(PATIENCE_S)
-    assert ends == ["COMPLETE"] * waiting
+    assert ends == ["COMPLETE"] * count
 
 
 def test_replicas_with_a_mesh_of_files_are_compared_by_the_files(tmp_path: Path) -> None:

@@ -153,6 +153,23 @@ def test_resuming_runs_only_what_is_not_done(
     assert len(SimulationStore.open(path).ids()) == 3
 
 
+def test_a_sweep_does_not_go_on_in_two_stores_that_were_copied_into_one(
+    path: Path, tip: StoredFingertip, press: IndentationResult, tmp_path: Path
+) -> None:
+    """Their trajectories are of two fingertips; the one of the other is named."""
+    softer = replace(tip, parameters=replace(tip.parameters, shear_modulus_pa=1e5))
+    with StoreWriter(tmp_path / "softer.sim", softer) as store:
+        store.write("cube/07/normal", press)
+    shutil.copytree(
+        tmp_path / "softer.sim" / "trajectories", path / "trajectories", dirs_exist_ok=True
+    )
+    with (
+        StoreWriter(path, tip, shared=True) as store,
+        pytest.raises(DatasetError, match=r"cube/07/normal\.h5: run on another fingertip"),
+    ):
+        store.done()
+
+
 def test_failed_simulation_leaves_no_trace(path: Path, tip: StoredFingertip) -> None:
     before = sorted(path.rglob("*"))
     with StoreWriter(path, tip) as store, pytest.raises(ZeroDivisionError), store.claim("a/b"):

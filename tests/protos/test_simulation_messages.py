@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,10 +16,17 @@ import pytest
 from palpate.bus import MAX_PAYLOAD_BYTES, QueryAnswer, Session, endpoints
 from palpate.bus.topics import caller_key
 from palpate.client import Client
-from palpate.client.simulations import join, straight_path
+from palpate.client.simulations import ask_simulation, join, straight_path
 from palpate.codec import SIMULATION_REPLY
 from palpate.config import LinkConfig
-from palpate.errors import ErrorCode, LinkError, RemoteError, SimulationError, WireError
+from palpate.errors import (
+    ErrorCode,
+    LinkError,
+    RemoteError,
+    ReplicaDiffers,
+    SimulationError,
+    WireError,
+)
 from palpate.messages import (
     Pose,
     SimulationOutcome,
@@ -266,3 +275,47 @@ def test_who_waits_no_longer_is_noticed(
             time.sleep(0.3)
             assert caller_key("lab", "again") not in gone
         wait_until(lambda: caller_key("lab", "again") in gone)
+
+
+class TwoServices:
+    """A session of which the first service is lost after some steps, and another one takes over."""
+
+    def __init__(self, first: list[SimulationReply], second: list[SimulationReply]) -> None:
+        self._answers = [first, second]
+
+    def caller_token(self, request_id: str) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def holders(self, *_: Any) -> list[Any]:
+        return [SimpleNamespace(instance=name, sensor="twin") for name in ("one", "two")]
+
+    def query_stream(self, *_: Any, **__: Any) -> Iterator[SimulationReply]:
+        parts = self._answers.pop(0)
+        yield from parts
+        if parts[-1].more:
+            raise LinkError("it was lost", remedy="look for it")
+
+
+def with_force(reply: SimulationReply, factor: float) -> SimulationReply:
+    """The same reply with other forces."""
+    steps = tuple(dataclasses.replace(one, force=one.force * factor) for one in reply.steps)
+    return dataclasses.replace(reply, steps=steps)
+
+
+def test_steps_of_two_services_that_went_different_ways_are_not_joined() -> None:
+    begun = [part(0), part(1)]
+    request = SimulationRequest("r", "cube", straight_path((0, 0, -0.02), (0, 0, -0.01), 3))
+
+    def ask(factor: float, on_step: Callable[[int, SimulationStep], None] | None) -> Any:
+        parts = [part(0), with_force(part(1), factor), part(2), LAST]
+        session: Any = TwoServices(begun, parts)
+        return ask_simulation(session, request, sensor="twin", timeout_s=20.0, on_step=on_step)
+
+    told: list[int] = []
+    assert len(ask(1.001, lambda number, _: told.append(number)).steps) == 3
+    assert told == [0, 1, 2], "rounding is no difference"
+    told.clear()
+    with pytest.raises(ReplicaDiffers, match=r"step 2 their forces are 0\.\d+ N apart"):
+        ask(1.02, lambda number, _: told.append(number))
+    assert told == [0, 1]
+    assert len(ask(1.02, None).steps) == 3, "the reply is of the second one alone"

@@ -8,7 +8,9 @@ when all processes are killed.
 from __future__ import annotations
 
 import contextlib
+import errno
 import faulthandler
+import logging
 import os
 import pickle
 import queue
@@ -23,6 +25,8 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+
+_log = logging.getLogger(__name__)
 
 SMALL_BYTES = 1 << 16
 """Arrays below this size are sent as they are."""
@@ -79,7 +83,8 @@ class Channel:
 
         Raises:
             EOFError: The other end is closed.
-            OSError: Likewise, or there is no memory.
+            OSError: Likewise.
+            MemoryError: There is no memory; the next value cannot be received either.
         """
         sizes, head = pickle.loads(self._connection.recv_bytes())
         if not sizes:
@@ -88,9 +93,9 @@ class Channel:
         if not descriptors:
             raise EOFError
         places = _places(sizes)
-        # Read, not mapped: a mapping would keep a descriptor open for as long as the value is kept.
-        memory = np.empty(places[-1] + sizes[-1], np.uint8).data
         try:
+            # Not mapped: a mapping would keep a descriptor open for as long as the value is kept.
+            memory = np.empty(places[-1] + sizes[-1], np.uint8).data
             done = 0
             while done < len(memory):
                 more = os.preadv(descriptors[0], [memory[done:]], done)
@@ -103,6 +108,11 @@ class Channel:
             head,
             buffers=[memory[at : at + size] for at, size in zip(places, sizes, strict=True)],
         )
+
+    def shut(self) -> None:
+        """Let nothing pass any more: who receives at either end finds the other closed."""
+        with contextlib.suppress(OSError):  # it is
+            self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Close this end."""
@@ -142,7 +152,8 @@ class Outbox:
 
     Args:
         channel: Where they go.
-        on_broken: Called once, from that thread, when the other end is closed.
+        on_broken: Called once, from that thread, when a message cannot be sent: the other end is
+            closed, or memory or descriptors have run out.
     """
 
     def __init__(self, channel: Channel, on_broken: Callable[[], None] = lambda: None) -> None:
@@ -184,6 +195,9 @@ class ChildProcess:
         threads: Threads that its libraries may use.
         on_message: Called with this object and each message, from a thread of its own.
         on_gone: Called with this object once, from that thread, when it has ended.
+
+    Raises:
+        OSError: There is no memory for it, or there are too many processes, threads or descriptors.
     """
 
     def __init__(
@@ -207,10 +221,17 @@ class ChildProcess:
                 env={**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(threads))},
             )
         self._channel = Channel(ours.detach())
-        self._outbox = Outbox(self._channel)
-        self.send(first)
+        # A message that cannot be sent would be waited for without end: the process is ended.
         self._reader = threading.Thread(target=self._read, name=f"child {self.pid}", daemon=True)
-        self._reader.start()
+        try:
+            self._outbox = Outbox(self._channel, self._channel.shut)
+            self.send(first)
+            self._reader.start()
+        except RuntimeError as error:  # of threading
+            self._process.kill()
+            self._process.wait()
+            self._channel.shut()
+            raise OSError(errno.EAGAIN, "no thread can be started") from error
 
     @property
     def pid(self) -> int:
@@ -246,10 +267,12 @@ class ChildProcess:
     def _read(self) -> None:
         while True:
             try:
-                message = self._channel.receive()
+                self._on_message(self, self._channel.receive())
             except (EOFError, OSError):
                 break
-            self._on_message(self, message)
+            except Exception:  # out of memory, or a defect: it cannot be heard any more
+                _log.exception("a message of process %d is lost", self.pid)
+                break
         # The status of one that has ended by itself is its own; one that still runs is of no use.
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(0.1)

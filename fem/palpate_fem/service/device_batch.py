@@ -1,7 +1,8 @@
 """Many trajectories on this host's GPUs: a process for each, which solves them in slots.
 
 A process that dies or hangs costs nobody's trajectories: the other devices get them; the last one
-is started once more. What a device does not solve goes to worker processes on the CPU.
+is started again, once without having solved anything. What a device does not solve, or what two
+processes did not survive, goes to worker processes on the CPU.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import queue
 import threading
 import time
 from abc import abstractmethod
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
@@ -58,6 +59,10 @@ SLOTS = 128
 
 SLOTFULS = 2
 """Times its slots that a device has trajectories: as many wait there as are at work."""
+
+LOSSES_MOST = 2
+"""Processes of devices that end with a trajectory on them; then a CPU solves it: it may be what
+ends them."""
 
 ON_CPU_MOST = 256
 """Trajectories that run or wait on CPUs; then devices get no new ones."""
@@ -405,7 +410,8 @@ class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
         self._setup, self._threads = setup, threads
         self._hang_s, self._start_s = hang_s, start_s
         self._indenters, self._gives_up = indenters, gives_up
-        self._again = False  # whether the last one was started once more
+        self._losses: Counter[int] = Counter()  # of processes that had a trajectory
+        self._again = False  # whether the last one was started again and has solved nothing since
         for device in devices:
             self._start(device)
 
@@ -439,20 +445,30 @@ class DeviceBatch(SlottedBatch[DeviceProcess[TrajectoryPlan]]):
             return None
         if isinstance(found, PlanEnded):
             self._workers.open -= 1
+        elif isinstance(found[1], PressEnded | PressUnsolved):
+            self._again = False
         return found
 
     def _on_gone(self, process: DeviceProcess[TrajectoryPlan]) -> None:
         """Give back what a process had; start it again if it was the last."""
         self._devices.remove(process)
-        self._supply.given_back.extend(process.open.items())
+        to_cpu = False
+        for number, plan in process.open.items():
+            self._losses[number] += 1
+            if self._losses[number] < LOSSES_MOST:
+                self._supply.given_back.append((number, plan))
+            else:
+                to_cpu = True
+                self._cpu.put(plan)
         why, said = process.why_it_ended(), process.last_words
         if self._closing:
             return
         _log.warning("the solver on %s %s", process.device, why)
         if self._devices:
             return
-        # One that says why it does not start would say it again.
-        if self._again or (said is not None and not process.warm):
+        # One that says why it does not start would say it again. Without those that are left to the
+        # CPU it may work.
+        if (self._again and not to_cpu) or (said is not None and not process.warm):
             raise RemoteError(
                 f"the solver on {process.device} {why}" + ", again" * self._again,
                 remedy=said.remedy

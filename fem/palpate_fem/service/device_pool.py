@@ -27,6 +27,7 @@ from palpate.rigid import path_lengths
 from palpate_fem.arrays import Floats
 from palpate_fem.indenter.catalogue import indenter_names, make_indenter
 from palpate_fem.result import IndentationOutcome, IndentationStep
+from palpate_fem.service.device_batch import LOSSES_MOST
 from palpate_fem.service.device_process import HANG_S, START_S, DeviceProcess
 from palpate_fem.service.jobs import (
     DeviceEvent,
@@ -60,10 +61,6 @@ SAME = 1e-2
 PAUSE_S = 1.0
 """Time after which a device's process is started again [s]; doubled each time until one solves a
 trajectory."""
-
-LOSSES_MOST = 2
-"""Processes of a device that end with a job on them; then workers solve it: it may be what ends
-them."""
 
 _LONGEST_PAUSE_S = 300.0
 _LEAST_FORCE_N = 0.01
@@ -387,7 +384,8 @@ class DevicePool(Closing):
                 process.send(ResultTaken())
                 self._pause_s = PAUSE_S
                 self._typical_s += 0.3 * (result.seconds - self._typical_s)
-                self._finish(self._taken(process, number), JobEnded.of(result))
+                task = self._taken(process, number)
+                self._finish(task, self._ended(task, JobEnded.of(result)))
             case PressRefused(number, failed):
                 self._finish(self._taken(process, number), failed)
             case PressUnsolved(number):

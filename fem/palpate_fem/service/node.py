@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate import __version__
-from palpate.bus import Presence, Publisher, QueryAnswer, SensorClaims, Session, endpoints
+from palpate.bus import Presence, QueryAnswer, SensorClaims, Session, endpoints
 from palpate.bus.presence import GoneCallers
 from palpate.bus.queryable import Queryable
 from palpate.bus.topics import SIMULATION_PROGRESS, caller_key, duty_root
@@ -27,9 +27,7 @@ from palpate.errors import (
     ClaimedElsewhere,
     ConfigError,
     ErrorCode,
-    LinkError,
     PalpateError,
-    RemoteError,
     SimulationError,
     WireError,
 )
@@ -39,30 +37,19 @@ from palpate.messages import (
     ServiceState,
     SimulationCancelReply,
     SimulationCancelRequest,
-    SimulationPhase,
-    SimulationProgress,
     SimulationReply,
     SimulationRequest,
 )
 from palpate.process import Closing
 from palpate_fem.config import FingertipParameters
-from palpate_fem.result import IndentationOutcome, IndentationStep
 from palpate_fem.service.config import DEFAULT_FACTORY, FemConfig
 from palpate_fem.service.device_pool import DevicePool
 from palpate_fem.service.device_process import wanted_device
 from palpate_fem.service.fingertips import load_factory, without_friction
-from palpate_fem.service.jobs import (
-    JobEnded,
-    JobEvent,
-    JobFailed,
-    JobStarted,
-    JobWaiting,
-    Pressurising,
-    StepConverged,
-    WorkerSetup,
-)
+from palpate_fem.service.jobs import JobEnded, JobEvent, JobFailed, WorkerSetup
 from palpate_fem.service.pool import WorkerPool
-from palpate_fem.service.requests import OUTCOMES, as_step, job_of
+from palpate_fem.service.replies import ActiveSimulation, EventOutbox
+from palpate_fem.service.requests import job_of
 from palpate_fem.store.content import StoredFingertip
 
 SERVICE = "fem"
@@ -71,120 +58,11 @@ _POLL_S = 0.1
 _CLAIM_S = 1.0
 """A key that is free is claimed within this time [s]."""
 
+_CLOSE_S = 5.0
+"""Longest time that callers may take to receive how their simulations ended, at the end [s]."""
+
 _FINGERTIPS_KNOWN = 16
 _REFUSED = (ErrorCode.INVALID_REQUEST, ErrorCode.RESOURCE_EXHAUSTED, ErrorCode.UNAVAILABLE)
-
-
-class ActiveSimulation:
-    """An accepted request: turns the events of its job into replies and progress.
-
-    Args:
-        request: As received.
-        answer: Sends the replies to the caller.
-        progress: Publishes progress for everybody else.
-
-    Attributes:
-        steps_done: Steps that were sent.
-        since_s: When it was accepted [s, monotonic].
-    """
-
-    def __init__(
-        self,
-        request: SimulationRequest,
-        answer: QueryAnswer[SimulationReply],
-        progress: Publisher[SimulationProgress],
-    ) -> None:
-        self.request = request
-        self.answer = answer
-        self.steps_done = 0
-        self._progress = progress
-        self.since_s = time.monotonic()
-        self._mesh = b""
-
-    @property
-    def elapsed_s(self) -> float:
-        """Time since it was accepted [s]."""
-        return time.monotonic() - self.since_s
-
-    def on_event(self, event: JobEvent) -> None:
-        """Send what an event means to the caller.
-
-        Raises:
-            WireError: A result that the contract does not allow.
-        """
-        match event:
-            case JobWaiting(before):
-                self._send(SimulationPhase.WAITING, waiting_before=before)
-            case Pressurising():
-                self._send(SimulationPhase.PRESSURISING)
-            case JobStarted(fingertip):
-                self._mesh = fingertip.mesh.sha256
-                self._send(SimulationPhase.INDENTING)
-            case StepConverged(step):
-                self._send(SimulationPhase.INDENTING, step)
-            case JobEnded():
-                self._end(event)
-            case JobFailed():
-                self.answer.fail(event.error())
-
-    def _send(
-        self,
-        phase: SimulationPhase,
-        step: IndentationStep | None = None,
-        *,
-        waiting_before: int = 0,
-    ) -> None:
-        """Send progress, with a step if one has converged."""
-        first = self.steps_done
-        self.steps_done += step is not None
-        progress = SimulationProgress(
-            self.request.request_id,
-            self.steps_done,
-            len(self.request.path) - 1,
-            self.elapsed_s,
-            phase,
-            waiting_before,
-        )
-        self.answer.send(
-            SimulationReply(
-                self.request.request_id,
-                self._mesh,
-                () if step is None else (as_step(step, self.request),),
-                elapsed_s=progress.elapsed_s,
-                more=True,
-                first_step=first,
-                progress=progress,
-            )
-        )
-        try:
-            self._progress.put(progress)
-        except LinkError:  # for onlookers only; the answer does not depend on it
-            return
-
-    def _end(self, event: JobEnded) -> None:
-        if event.outcome is IndentationOutcome.DEADLINE and not self.steps_done:
-            self.answer.fail(
-                RemoteError(
-                    f"no step converged within {self.elapsed_s:.1f} s: {event.reason}",
-                    remedy="allow more time (deadline_s); palpate status shows how many wait",
-                    code=ErrorCode.DEADLINE_EXCEEDED,
-                )
-            )
-            return
-        no_reason = "" if event.outcome is IndentationOutcome.COMPLETE else event.outcome.value
-        self.answer.send(
-            SimulationReply(
-                self.request.request_id,
-                self._mesh,
-                (),
-                event.reason or no_reason,
-                self.elapsed_s,
-                first_step=self.steps_done,
-                outcome=OUTCOMES[event.outcome],
-                travel_m=event.travel_m,
-            )
-        )
-        self.answer.end()
 
 
 class SimulationService(Closing):
@@ -210,15 +88,16 @@ class SimulationService(Closing):
         self._config = config
         self._default = default
         self._health = health
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # to cancel a job ends it at once if it waits
         self._active: dict[str, ActiveSimulation] = {}
+        self._outboxes: list[EventOutbox] = []
         self._gone = GoneCallers()
         self._fingertips: OrderedDict[FingertipParameters, StoredFingertip] = OrderedDict()
         self._progress = session.publisher(SIMULATION_PROGRESS, sensor=config.sensor)
         self.pool = _pool_of(config, default, device, self._remember)
 
     def simulate(self, request: SimulationRequest, answer: QueryAnswer[SimulationReply]) -> None:
-        """Accept a request; the pool's threads send the answer.
+        """Accept a request; a thread of its own sends the answer.
 
         Raises:
             ConfigError: The request is refused; says why.
@@ -238,11 +117,15 @@ class SimulationService(Closing):
                         remedy="choose another, e.g. uuid.uuid4().hex",
                     )
                 self._active[request.request_id] = active
+            outbox = EventOutbox(lambda event: self._pass_on(active, event))
             try:
-                self.pool.submit(job, lambda event: self._on_event(active, event))
+                self.pool.submit(job, lambda event: self._on_event(active, outbox, event))
             except PalpateError:
+                outbox.drop()
                 self._forget(active)
                 raise
+            with self._lock:
+                self._outboxes = [one for one in self._outboxes if one.is_open] + [outbox]
             key = caller_key(self._station, request.request_id)
             if (gone_s := self._gone.since(key)) is not None:  # while the question waited
                 self.caller_gone(key, gone_s)
@@ -265,14 +148,14 @@ class SimulationService(Closing):
         """
         self._gone.add(key, when_s)
         with self._lock:
-            ids = [
-                name
+            left = [
+                active
                 for name, active in self._active.items()
                 if active.answer.arrived_ns * 1e-9 <= when_s
                 and caller_key(self._station, name) == key
             ]
-        for name in ids:
-            if self.pool.cancel(name):
+        for active in left:
+            if self._stop(active):
                 self._health.count("callers_gone")
 
     def refresh_health(self) -> None:
@@ -285,12 +168,23 @@ class SimulationService(Closing):
     def close(self) -> None:
         """Answer whatever waits or runs with UNAVAILABLE, and end the workers."""
         self.pool.close()
+        end_s = time.monotonic() + _CLOSE_S
+        with self._lock:
+            outboxes = self._outboxes
+        for outbox in outboxes:
+            outbox.join(max(0.0, end_s - time.monotonic()))
 
-    def _on_event(self, active: ActiveSimulation, event: JobEvent) -> None:
+    def _on_event(self, active: ActiveSimulation, outbox: EventOutbox, event: JobEvent) -> None:
+        """Take an event of a job, in a thread of the pool that serves others, too."""
         # Forgotten before the last reply, so that the caller may use the same request_id again.
-        over = isinstance(event, JobEnded | JobFailed)
-        if over:
+        if isinstance(event, JobEnded | JobFailed):
             self._forget(active)
+        if not outbox.put(event):
+            self._health.count("callers_too_slow")
+            self._stop(active)
+
+    def _pass_on(self, active: ActiveSimulation, event: JobEvent) -> None:
+        """Send what an event means, in the thread of its outbox."""
         try:
             active.on_event(event)
         except WireError as error:  # a result that the contract does not allow
@@ -299,7 +193,7 @@ class SimulationService(Closing):
                 remedy="the solver went wrong: report it with this request",
             )
             active.answer.fail(ours)
-            self.pool.cancel(active.request.request_id)
+            self._stop(active)
             self._health.fail(ours, degraded=False)
         if isinstance(event, JobEnded):
             self._health.count(f"simulations_{event.outcome.name.lower()}")
@@ -308,6 +202,12 @@ class SimulationService(Closing):
         elif isinstance(event, JobFailed):
             self._health.count("simulations_failed")
             self._health.fail(event.error(), degraded=False)
+
+    def _stop(self, active: ActiveSimulation) -> bool:
+        """Cancel the job of a request, and not of a later one with its id; whether it was there."""
+        name = active.request.request_id
+        with self._lock:
+            return self._active.get(name) is active and self.pool.cancel(name)
 
     def _forget(self, active: ActiveSimulation) -> None:
         with self._lock:
@@ -458,8 +358,9 @@ class _Doors(Closing):
         self._session, self._claims, self._service = session, claims, service
         self._sensor, self._instance = config.sensor, instance
         # The pool refuses what is too much, and says when to ask again; the door must not be
-        # narrower, for many robots may ask in the same instant.
-        self._capacity = max(16, config.waiting + config.slots)
+        # narrower, for many robots may ask in the same instant: as many as run and wait on a
+        # device, and with the workers.
+        self._capacity = max(16, 2 * config.waiting + config.slots + config.workers)
         self._open: list[Queryable] = []
 
     def check(self) -> ClaimedElsewhere | None:

@@ -11,6 +11,7 @@ import threading
 
 import numpy as np
 
+from palpate.heartbeat import Turns
 from palpate.process import Closing
 from palpate_fem.result import IndentationResult
 from palpate_fem.service.channel import ChildProcess, channel_to_parent
@@ -19,6 +20,12 @@ from palpate_fem.store.writer import TrajectoryClaim, TrajectoryImages
 
 _JOBS_EACH = 2
 """Trajectories that a process has at most: one that it packs, and the next."""
+
+
+HANG_S = 60.0
+"""A process that has trajectories and is silent for so long is ended [s]."""
+
+_LOOK_S = 0.2
 
 
 class PackingProcesses(Closing):
@@ -36,6 +43,7 @@ class PackingProcesses(Closing):
         self._closing = False
         self._orphans = 0  # of processes that have ended, being packed here
         self._jobs: dict[ChildProcess, dict[int, tuple[TrajectoryClaim, IndentationResult]]] = {}
+        self._turns: dict[ChildProcess, Turns] = {}
         with self._changed:
             for _ in range(count):
                 child = ChildProcess(
@@ -45,7 +53,7 @@ class PackingProcesses(Closing):
                     on_message=self._on_made,
                     on_gone=self._on_gone,
                 )
-                self._jobs[child] = {}
+                self._jobs[child], self._turns[child] = {}, Turns()
 
     @property
     def pids(self) -> list[int]:
@@ -62,11 +70,13 @@ class PackingProcesses(Closing):
             while self._jobs and self._error is None:
                 child = min(self._jobs, key=lambda one: len(self._jobs[one]))
                 if len(self._jobs[child]) < _JOBS_EACH:
+                    if not self._jobs[child]:
+                        self._turns[child].next(HANG_S)
                     number = next(self._numbers)
                     self._jobs[child][number] = (claim, result)
                     child.send(ImageJob(number, claim.trajectory, result))
                     return
-                self._changed.wait()
+                self._wait()
         with claim:
             self._raise()
             claim.write(result)  # all processes are gone
@@ -78,9 +88,8 @@ class PackingProcesses(Closing):
             StoreDiskError: The disk refused one.
         """
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._error or not (any(self._jobs.values()) or self._orphans)
-            )
+            while self._error is None and (any(self._jobs.values()) or self._orphans):
+                self._wait()
         self._raise()
 
     def close(self) -> None:
@@ -92,6 +101,13 @@ class PackingProcesses(Closing):
             child.kill()
         for child in children:
             child.join()
+
+    def _wait(self) -> None:
+        """Wait a moment for a change; what a process that hangs had is made here then."""
+        for child, jobs in self._jobs.items():
+            if jobs and self._turns[child].are_late():
+                child.kill()
+        self._changed.wait(_LOOK_S)
 
     def _raise(self) -> None:
         if self._error is not None:
@@ -105,6 +121,7 @@ class PackingProcesses(Closing):
         except Exception as error:  # raised again where the next one is put
             self._error = self._error or error
         with self._changed:
+            self._turns[child].next(HANG_S)
             del self._jobs[child][made.number]
             self._changed.notify_all()
 

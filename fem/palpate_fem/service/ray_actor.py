@@ -110,6 +110,7 @@ class RayDevice:
         answer: Ray's reference of its next events.
         heard_s: When it answered last [s, monotonic]; 0 = Ray has not found a place for it yet.
         useful: Whether it has solved something.
+        lost: Whether it answered once and Ray has lost it since, as it does with its machine.
         why: Why it ended.
     """
 
@@ -124,7 +125,7 @@ class RayDevice:
         silent_s: float,
     ) -> None:
         self.open: dict[int, TrajectoryPlan] = {}
-        self.ready = self.warm = self.useful = False
+        self.ready = self.warm = self.useful = self.lost = False
         self.last_words: JobFailed | None = None
         self.heard_s = 0.0
         self.why = ""
@@ -150,6 +151,7 @@ class RayDevice:
             found = self._ray.get(self.answer)
         except self._ray.exceptions.RayError as error:
             self.why = f"was lost: {last_line(error)}"
+            self.lost = self.heard_s > 0.0
             return [None]
         self.heard_s = time.monotonic()
         self._turns.next(self._silent_s)
@@ -167,6 +169,7 @@ class RayDevice:
         """Whether its machine counts as lost; to be asked often."""
         if not self._turns.are_late():
             return False
+        self.lost = True
         self.why = f"did not answer for {self._silent_s:g} s"
         return True
 

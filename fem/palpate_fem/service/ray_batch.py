@@ -231,7 +231,9 @@ class RayBatch(SlottedBatch[RayDevice]):
         self._events: deque[tuple[RayDevice, DeviceEvent | None] | PlanEnded] = deque()
         self._described: Any = None  # reference of the fingertip, if there are no devices
         self._losses: Counter[int] = Counter()
-        self._in_vain = 0  # actors that ended without having solved anything
+        # Actors that ended without having solved anything, though not with their machine; since
+        # one has solved something for the first time.
+        self._in_vain = 0
         self._looked_s = -math.inf
         self._there_s = time.monotonic()  # when there was a machine last
         if device is None:
@@ -333,7 +335,10 @@ class RayBatch(SlottedBatch[RayDevice]):
         for reference in ray.wait(wanted, timeout=POLL_S)[0]:
             if reference in devices:
                 device = devices[reference]
+                was_useful = device.useful
                 self._events.extend((device, event) for event in device.events())
+                if device.useful and not was_useful:
+                    self._in_vain = 0
             elif reference in self._share.tasks:
                 self._events.append(self._share.end_of(reference))
             else:
@@ -368,7 +373,7 @@ class RayBatch(SlottedBatch[RayDevice]):
         device.kill()
         why, said = device.why_it_ended(), device.last_words
         _log.warning("a solver on the cluster %s", why)
-        if not device.useful:
+        if not (device.useful or device.lost):
             self._in_vain += 2 if said is not None and not device.warm else 1
         units = self._units()
         if not self._devices and 0 < units <= self._in_vain // 2:

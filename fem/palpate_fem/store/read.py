@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from palpate.files.hdf5 import text
 from palpate.files.simulation_store import SimulationFiles
 from palpate_fem.result import IndentationOutcome, IndentationResult
@@ -19,9 +21,16 @@ class SimulationStore(SimulationFiles):
         """Ids that a resumed sweep does not run again: all except those cancelled or out of time.
 
         Raises:
-            DatasetError: A file is damaged; names it.
+            DatasetError: A file is damaged, or belongs to another fingertip, e.g. since two stores
+                were copied into one; names it.
         """
-        return {name for name in self.ids() if self.outcome(name) not in UNFINISHED}
+        key, found = self._key(), set()
+        for name in self.ids():
+            with self.group(name) as group:
+                self._check_key(name, group, key)
+                if _outcome(group) not in UNFINISHED:
+                    found.add(name)
+        return found
 
     def outcome(self, trajectory: str) -> IndentationOutcome:
         """How a trajectory ended; a measured one is complete.
@@ -30,9 +39,7 @@ class SimulationStore(SimulationFiles):
             DatasetError: Not there, or damaged.
         """
         with self.group(trajectory) as group:
-            return IndentationOutcome(
-                text(group.attrs.get("outcome", IndentationOutcome.COMPLETE.value))
-            )
+            return _outcome(group)
 
     def fingertip(self) -> StoredFingertip:
         """Mesh, parameters and pressurised state that all trajectories share.
@@ -60,3 +67,7 @@ class SimulationStore(SimulationFiles):
         """
         with self.group(trajectory) as group:
             return read_trajectory(group)
+
+
+def _outcome(group: Any) -> IndentationOutcome:
+    return IndentationOutcome(text(group.attrs.get("outcome", IndentationOutcome.COMPLETE.value)))

@@ -12,6 +12,9 @@ import random
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from palpate.bus import Session, endpoints
 from palpate.bus.topics import duty_root
 from palpate.config import check_name
@@ -69,6 +72,10 @@ def straight_path(
     )
 
 
+_SAME, _LEAST_FORCE_N = 1e-2, 0.01
+"""Share of the largest force, or of this one [N], by which a step of two services may differ: one
+may have a GPU (ADR 26)."""
+
 _COMES_BACK_S, _POLL_S = 2.0, 0.05
 """How long another service is waited for where one was lost, as what cut that one off may have cut
 off both, and how often it is looked for [s]."""
@@ -98,7 +105,8 @@ def ask_simulation(
         LinkError: No finite-element service runs.
         RemoteError: It refuses, or cannot go on. Steps that had converged were given to
             ``on_step``.
-        ReplicaDiffers: One ended, and another would answer for another fingertip.
+        ReplicaDiffers: One ended, and another answers for another fingertip, or with other forces
+            in steps that were given to ``on_step``.
         StreamTimeout: No answer within ``GRACE_S`` after the deadline, or it was over before a
             service could be asked.
         WireError: The request, or an answer, breaks the contract.
@@ -172,7 +180,7 @@ class _StepsOnce:
 
     def __init__(self, on_step: OnStep | None) -> None:
         self._on_step = on_step
-        self._told = 0
+        self._told: list[NDArray[np.float64]] = []  # their forces [N], each of shape (3,)
         self._mesh = b""
 
     def watch(self, parts: Iterable[SimulationReply]) -> Iterator[SimulationReply]:
@@ -189,10 +197,20 @@ class _StepsOnce:
 
     def take(self, number: int, step: SimulationStep) -> None:
         """A step of the service that answers now."""
-        if number >= self._told:
-            self._told = number + 1
-            if self._on_step is not None:
-                self._on_step(number, step)
+        if self._on_step is None:  # the reply has the steps of one service
+            return
+        if number == len(self._told):
+            self._told.append(step.force)
+            self._on_step(number, step)
+            return
+        apart_n = float(np.linalg.norm(step.force - self._told[number]))
+        largest_n = max(float(np.linalg.norm(force)) for force in self._told)
+        if apart_n > _SAME * max(largest_n, _LEAST_FORCE_N):
+            raise ReplicaDiffers(
+                f"the service that took over went another way than the one that began: in step "
+                f"{number + 1} their forces are {apart_n:.3f} N apart",
+                remedy="ask again with shorter steps; give all services a GPU, or none",
+            )
 
 
 def ask_cancellation(session: Session, request_id: str, *, sensor: str, timeout_s: float) -> bool:

@@ -109,20 +109,32 @@ class SimulationFiles:
         Raises:
             DatasetError: One is damaged, or belongs to another fingertip; names it.
         """
-        with self.head() as file:
-            key = text(file["fingertip"].attrs["key"]) if "fingertip" in file else ""
+        key = self._key()
         names = self.ids()
         for name in names:
             with self.group(name) as group:
-                if text(group.attrs.get("fingertip", "")) != key:
-                    raise DatasetError(
-                        f"{self.file_of(name)}: run on another fingertip than the store's",
-                        remedy="remove it; a resumed sweep runs it again",
-                    )
+                self._check_key(name, group, key)
                 for dataset in group.values():
                     if isinstance(dataset, self._h5.Dataset):
                         dataset[()]
         return len(names)
+
+    def _key(self) -> str:
+        """Key of the fingertip of all trajectories; empty for measured ones."""
+        with self.head() as file:
+            return text(file["fingertip"].attrs["key"]) if "fingertip" in file else ""
+
+    def _check_key(self, trajectory: str, group: h5py.Group, key: str) -> None:
+        """Refuse the group of a trajectory that is another fingertip's.
+
+        Raises:
+            DatasetError: It is; names it.
+        """
+        if text(group.attrs.get("fingertip", "")) != key:
+            raise DatasetError(
+                f"{self.file_of(trajectory)}: run on another fingertip than the store's",
+                remedy="remove it; a resumed sweep runs it again",
+            )
 
     def file_of(self, trajectory: str) -> Path:
         """The file of a trajectory, which need not exist."""
