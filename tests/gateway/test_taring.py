@@ -225,7 +225,7 @@ def test_a_sensor_with_one_sample_of_pac_a_frame_can_be_tared() -> None:
 def bits_of(channel: str) -> int:
     layout = fakes.LAYOUT
     pac = layout.all_valid >> layout.first_pac_bit << layout.first_pac_bit
-    return {"PAC": pac, "TAC": 1 << layout.tac_bit, "TDC": 1 << layout.tdc_bit}[channel]
+    return int({"PAC": pac, "TAC": 1 << layout.tac_bit, "TDC": 1 << layout.tdc_bit}[channel])
 
 
 @pytest.mark.parametrize("channel", ["PAC", "TAC", "TDC"])

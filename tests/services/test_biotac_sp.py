@@ -111,8 +111,12 @@ def test_features_service_names_the_sensor_and_serves_the_others(
         assert subscribed.next(5.0).message.electrodes.shape == (24,)
         # A service that refuses all of a sensor says so until somebody chooses what it serves.
         later = itertools.count(5)
-        until(lambda: thumb.put(make_frame(next(later), sensor_type=SP)) is None
-              and robot.status()[0].state is ServiceState.DEGRADED)  # fmt: skip
+
+        def refused() -> bool:
+            thumb.put(make_frame(next(later), sensor_type=SP))
+            return robot.status()[0].state is ServiceState.DEGRADED
+
+        until(refused)
         error = robot.status()[0].last_error
         assert error is not None
         assert "everything of sensor 'thumb' is refused" in error.message

@@ -186,8 +186,8 @@ def _local_presses(presses: int, rows: int) -> tuple[FloatArray, Labels]:
     rise = np.sin(np.linspace(0.1, 3.0, rows))[:, None]
     depth = rise * rng.uniform(100.0, 800.0, (presses, 1, 1))
     counts = -depth * np.exp(-(((np.linspace(-1.0, 1.0, 19) - place) / width) ** 2))
-    counts = np.round(counts + rng.normal(0.0, 2.0, counts.shape)).astype(np.float32)
-    return counts.reshape(-1, 19), np.repeat(np.arange(presses), rows)
+    told: FloatArray = np.round(counts + rng.normal(0.0, 2.0, counts.shape)).astype(np.float32)
+    return told.reshape(-1, 19), np.repeat(np.arange(presses), rows)
 
 
 def test_an_electrode_that_never_changed_is_no_rule_made_of_rounding(press_data: MakeData) -> None:

@@ -112,9 +112,9 @@ def _onward(
             back_ns = last.time_ns + gained_ns - earlier[0].time_ns
             shift_ns += back_ns
             earlier = [each._replace(time_ns=each.time_ns + back_ns) for each in earlier]
-        *others, last = sorted(earlier, key=lambda each: each.time_ns)
-        yield from others
-        before, earlier = others[-1], []
+        earlier.sort(key=lambda each: each.time_ns)
+        yield from earlier[:-1]
+        before, last, earlier = earlier[-2], earlier[-1], []
     if last is not None:
         yield last
     yield from earlier

@@ -12,6 +12,7 @@ one skin over one core, and an input that breaks these rules is odd long before 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -134,7 +135,9 @@ def with_pattern(
         np.isin(groups, part) for part in np.array_split(names, min(_PATTERN_FOLDS, len(names)))
     ]
     parts = [_products(rows[out], scale, origin) for out in held]
-    every = sum(parts) if among else _products(whole, scale, origin) + sum(parts)
+    every = functools.reduce(np.add, parts)
+    if not among:
+        every = _products(whole, scale, origin) + every
     strange = np.zeros(len(rows))
     for out, part in zip(held, parts, strict=True):
         strange[out] = strangeness(_pattern(every - part, scale, origin, shrink), rows[out])

@@ -56,13 +56,13 @@ def held_bounds(
         number of ``specimens``. Rows without a known error do not count; a bound is left out where
         there are not two specimens.
     """
-    errors, *every = _bounded(quantities, estimate, rows, tested)
-    every += rows.specimen[tested], fingertip[tested]
+    errors, all_terms, all_presses = _bounded(quantities, estimate, rows, tested)
     found: dict[str, Any] = {}
     for name, values in errors.items():
         known = ~np.isnan(values)
         error = values[known]
-        terms, press, specimen, tip = (one[known] for one in every)
+        terms, press = all_terms[known], all_presses[known]
+        specimen, tip = rows.specimen[tested][known], fingertip[tested][known]
         bound = np.full(len(error), np.nan)
         for learned, other in _halves(specimen, tip):
             formula = fit_formula(
