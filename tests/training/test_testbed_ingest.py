@@ -139,14 +139,16 @@ def test_of_two_arms_one_may_publish_its_pose(
     between_ns = START_NS + round(second.start_s * 1e9)
     streams[POSE.name] = [p for p in streams[POSE.name] if p.stamp.wall_ns < between_ns]
     record = write(streams, tmp_path / "r.mcap")
-    log = joint_log([second], bases["right"].arm, tmp_path / "right.csv")
+    right = bases["right"].arm
+    assert right is not None
+    log = joint_log([second], right, tmp_path / "right.csv")
     back = ingest_experiment(
         record,
         write_trajectories(two_arms, tmp_path / "plan.jsonl"),
         unit="biotac-1",
         sensor="finger",
         start_wall_ns=START_NS,
-        joint_logs={"right": JointLog(log, bases["right"].arm)},
+        joint_logs={"right": JointLog(log, right)},
     )
     for trial, motion, error_m in zip(back, two_arms.motions, (ERROR_M, np.zeros(3)), strict=True):
         off = trial.tip[trial.increment_end] - motion.trajectory.poses[1:, :3] - error_m

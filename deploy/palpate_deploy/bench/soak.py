@@ -290,8 +290,8 @@ class _Watch:
         lost = self._losses(totals)
         lost.subtract(self._before or Counter())
         received = self._client.received.copy()
-        for topic, sensor in product(_TOPICS, self._profile.gateway.sensors):
-            key = topic.name, sensor.name
+        names = [sensor.name for sensor in self._profile.gateway.sensors]
+        for key in product((topic.name for topic in _TOPICS), names):
             lost[f"client all {key[0]} of {key[1]}"] += received[key] <= self._received_before[key]
         seconds, size = self.disk[-1]
         processes = growths(self.histories, self._warm_up_s)

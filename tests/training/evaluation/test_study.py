@@ -356,7 +356,7 @@ def test_the_page_of_a_test_without_hard_presses_is_written(
 def test_a_ratio_is_given_only_beside_all_of_the_paper_s_networks(
     data: ExperimentDataset, tmp_path: Path
 ) -> None:
-    def ratios(*systems: str) -> list[Any]:
+    def ratios(*systems: str) -> Any:
         plan = StudyPlan(("force",), ("trajectory",), systems, seeds=(0,), whole=True)
         study = Study(ExperimentSource(data, None), plan)
         study.make(tmp_path / "cells", workers=0)
