@@ -254,6 +254,23 @@ def test_the_share_of_a_core_is_of_the_time_in_which_frames_are_sent(
     assert result.cores["gateway"] == pytest.approx(sending_s, abs=1e-3)
 
 
+@pytest.mark.parametrize("untared", [(), (1,), (0, 1)])
+def test_fingers_without_a_tare_are_no_load(tmp_path: Path, untared: tuple[int, ...]) -> None:
+    """Their frames need no estimate, so that none is lost."""
+    tared = [number for number in (0, 1) if number not in untared]
+    rows = [(n, n, n + 1) for _ in tared for n in range(100)]
+    names = [f"finger{number}" for number in tared for _ in range(100)]
+    write_rows(tmp_path / "client.npz", names, rows, dropped=0)
+    gateway = {f"finger{number}.frames_published": 150 for number in (0, 1)}
+    gateway |= {f"finger{number}.frames_untared": 150 if number in untared else 50
+                for number in (0, 1)}  # fmt: skip
+    counters = {"gateway": gateway, "features": {"estimates_published": len(rows)}}
+    result = load._account(tmp_path / "client.npz", "features", 2, 100.0, counters, 1.5, {})
+    assert (result.lost, result.silent) == (0, len(untared))
+    assert result.met is not bool(untared)
+    assert ("without any estimate" in result.sentences()[0]) is bool(untared)
+
+
 @pytest.mark.slow
 def test_swap_mixes_no_bundles(palpate: Palpate, bundle: str) -> None:
     """How many frames a loaded host loses is measured, not tested."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from palpate.errors import LinkError
 from palpate.messages import ServiceState, Status
 from palpate_deploy.bench.hand import GatewayUse, HandResult, account
 
@@ -20,7 +21,12 @@ SENSORS = [*(f"finger{k}" for k in range(5)), "kms40", "bota"]
 
 
 def accounted(
-    folder: Path, rows: list[list[int]], *, dropped: int = 0, end_ns: int = 12 * 10**6
+    folder: Path,
+    rows: list[list[int]],
+    *,
+    dropped: int = 0,
+    end_ns: int = 12 * 10**6,
+    heard: Sequence[bool] = (True,) * 4,
 ) -> HandResult:
     client, floor = folder / "client.npz", folder / "floor.npz"
     np.savez(
@@ -29,7 +35,7 @@ def accounted(
         rows=np.array(rows, np.int64),
         dropped=np.int64(dropped),
     )
-    np.savez(floor, late_s=np.array([1e-4, 2e-4]), core=np.float64(0.4))
+    np.savez(floor, late_s=np.array([1e-4, 2e-4]), core=np.float64(0.4), heard=np.array(heard))
     looks = [
         Status(
             "gateway",
@@ -92,6 +98,11 @@ def test_a_sensor_that_stops_owes_its_frames_until_the_end(tmp_path: Path) -> No
     assert accounted(tmp_path, stopped, end_ns=end_ns).lost == pytest.approx(2000, abs=5)
     just_one = [row for row in on if row[0] != 5 or row[1] <= 1]
     assert accounted(tmp_path, just_one, end_ns=end_ns).lost == 1
+
+
+def test_a_floor_that_read_nothing_of_a_device_is_none(tmp_path: Path) -> None:
+    with pytest.raises(LinkError, match="received from 3 of 4 devices"):
+        accounted(tmp_path, whole_run(), heard=(True, True, False, True))
 
 
 def test_no_loss_is_one_that_the_gateway_does_not_count_either(tmp_path: Path) -> None:

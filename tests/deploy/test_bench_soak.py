@@ -236,23 +236,74 @@ def test_soak_watches_a_whole_station(palpate: Palpate, tmp_path: Path) -> None:
     assert out.with_suffix(".png").stat().st_size > 10_000
 
 
+class WatchedStation:
+    """A station of two fingers whose processes and client are a test's."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.profile = soak.soak_profile(folder, 2, fem=False)
+        self.names = set(self.profile.processes) - {"router"}
+        monkeypatch.setattr(
+            soak,
+            "ask_status",
+            lambda *_, **__: [SimpleNamespace(service=one, counters={}) for one in self.names],
+        )
+        self.received: Counter[tuple[str, str]] = Counter()
+        client = SimpleNamespace(received=self.received, lost=lambda: Counter[str]())
+        self.watch = _Watch(
+            os.getpid(), self.profile, cast("Session", None), cast("_Client", client), 0.0
+        )
+
+    def come(self, *, without: Iterable[tuple[str, str]] = ()) -> None:
+        """A message of each topic and finger, but some."""
+        for topic in ("electrodes", "features", "field", "synthesis"):
+            for finger in ("finger1", "finger2"):
+                self.received[topic, finger] += (topic, finger) not in without
+
+    def look(self, looks: int = 2 * BINS + 2, **changes: Iterable[tuple[str, str]]) -> None:
+        for _ in range(looks):
+            self.watch.look()
+            self.come(**changes)
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WatchedStation:
+    return WatchedStation(tmp_path, monkeypatch)
+
+
 def test_counters_that_are_not_told_at_the_end_are_lost_and_the_rest_of_the_run_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    station: WatchedStation,
 ) -> None:
-    profile = soak.soak_profile(tmp_path, 1, fem=False)
-    told = SimpleNamespace(counters={"frames": 1})
-    names = set(profile.processes) - {"router"}
-    monkeypatch.setattr(
-        soak,
-        "ask_status",
-        lambda *_, **__: [SimpleNamespace(service=one, **vars(told)) for one in names],
-    )
-    client = SimpleNamespace(received={}, lost=lambda: Counter[str]())
-    watched = _Watch(os.getpid(), profile, cast("Session", None), cast("_Client", client), 0.0)
-    for _ in range(2 * BINS + 2):
-        watched.look()
-        time.sleep(0.01)
-    names.remove("features")
-    result = watched.result(1)
+    station.look()
+    assert station.watch.result(2).lost == {}
+    station.names.remove("features")
+    result = station.watch.result(2)
     assert result.lost == {"features counters lost: no answer": 1}
+    assert result.received["field"] == sum(station.received.values()) / 4
     assert not result.met
+
+
+def test_a_stream_of_which_nothing_comes_is_lost(station: WatchedStation) -> None:
+    """Of a service that is ready and does nothing, or a finger that stops in the warm-up."""
+    station.come()  # before the verdicts begin
+    station.look(without=[("synthesis", "finger1"), ("field", "finger2")])
+    result = station.watch.result(2)
+    assert result.lost == {
+        "client all synthesis of finger1": 1,
+        "client all field of finger2": 1,
+    }
+    assert not result.fine
+
+
+@pytest.mark.parametrize("samples", [3, 2 * BINS])
+def test_a_process_that_ends_for_good_is_lost_and_the_rest_of_the_run_is_kept(
+    station: WatchedStation, samples: int
+) -> None:
+    history = station.watch.histories["router"] = History()
+    for _ in range(samples):
+        history.add(station.watch.look(), 1, Use(100 << 20, 3, 10))
+    station.look()
+    result = station.watch.result(2)
+    assert result.lost == {"router not there all the time": 1}
+    assert "up" in result.processes
+    assert not result.fine

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,7 @@ from palpate.config import LinkConfig
 from palpate.files.bundle import read_bundle
 from palpate.messages import Tare
 from palpate_deploy.bench.codec import bench_frame
-from palpate_deploy.bench.swap import Judge
+from palpate_deploy.bench.swap import Account, Judge, goal_met
 from palpate_services.inference.estimates import EstimateRefusal, estimate
 from palpate_services.inference.model import load
 from palpate_services.inference.repository import resolve
@@ -61,3 +62,13 @@ def test_estimates_on_a_tare_from_before_the_bench_listened_are_judged(
     account = judge.account(0, clock.now()[0] + 1, Counter())
     assert (account.frames, account.lost, account.repeated, account.mixed) == (20, 0, 0, 1)
     assert account.bundles == {runtime.label: 20}
+
+
+def test_no_frame_is_no_goal() -> None:
+    """As of a gateway that hangs: it loses none."""
+    account = Account(frames=300, lost=0, repeated=0, mixed=0, gap_max_s=0.02)
+    assert goal_met(account, [0.01, 0.02], due=320.0)
+    assert not goal_met(replace(account, frames=0), [0.01], due=320.0)
+    assert not goal_met(replace(account, frames=100), [0.01], due=320.0)
+    assert not goal_met(replace(account, lost=1), [0.01], due=320.0)
+    assert not goal_met(account, [0.01, 0.2], due=320.0)

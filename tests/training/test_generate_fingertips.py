@@ -48,6 +48,8 @@ class Scripted(SharedExperiment[str]):
             raise DatasetError(f"{share.name} is damaged", remedy="remove it")
         if "killed" in share.name:
             os.kill(os.getpid(), signal.SIGKILL)
+        if "leaving" in share.name:  # after its end is told
+            threading.Timer(1.0, os._exit, [1]).start()
         if "long" in share.name and stop.wait(LONG_S):
             return None
         if "hanging" in share.name:
@@ -120,6 +122,14 @@ def test_one_that_fails_stops_the_others_and_is_named(
         list(experiment.made(shares("long", name, "never", "begun"), threading.Event()))
     assert time.monotonic() - began < LONG_S
     assert not (tmp_path / "begun.begun").exists()
+
+
+def test_one_that_dies_while_it_waits_is_named(tmp_path: Path) -> None:
+    """The only device is still busy with another, so nothing is given to it."""
+    experiment = scripted(tmp_path, "cuda:0")
+    with pytest.raises(WorkerLostError, match="the process that made pressed-leaving died"):
+        list(experiment.made(shares("pressed-leaving", "next.long", "never"), threading.Event()))
+    assert not (tmp_path / "never.begun").exists()
 
 
 def test_stopped_they_end_early_and_are_not_told_as_made(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,14 @@ from palpate_training.datasets.trials import RawTrial
 from palpate_training.experiment import stand_in_arm as stand_in
 from palpate_training.experiment.executed_plan import JointLog, ingest_experiment, read_joint_log
 from palpate_training.experiment.kinematics import ArmKinematics
-from palpate_training.experiment.plan import RobotPlan, commanded_travel
+from palpate_training.experiment.plan import ArmBase, ArmMotion, RobotPlan, commanded_travel
+from palpate_training.experiment.trajectory_file import write_trajectories
 
 sys.path.append(str(Path(__file__).parent))
 fakes: Any = importlib.import_module("testbed_fakes")
 arm, plan, plan_file, played = fakes.arm, fakes.plan, fakes.plan_file, fakes.played
 START_NS, ERROR_M = fakes.START_NS, fakes.ERROR_M
+bases, two_arms, play = fakes.bases, fakes.two_arms, fakes.play
 thin, streams_of, write = fakes.thin, fakes.streams_of, fakes.write
 PRINTED_NS = 1e-9
 """Times are kept in whole nanoseconds."""
@@ -73,6 +76,25 @@ def test_trajectories_have_starts_of_their_own(
         )
 
 
+def joint_log(motions: Iterable[ArmMotion], arm: ArmKinematics, path: Path) -> Path:
+    """Joint angles of motions that begin at START_NS, where `thin` keeps samples."""
+    lines = ["time_s," + ",".join(arm.joint_names)]
+    for motion in motions:
+        assert motion.joints is not None
+        travel = motion.trajectory.travel_m
+        near = np.concatenate([np.arange(7), np.arange(493, 500)]) / 100
+        at = (5.0 * np.arange(len(travel) - 1)[:, None] + near).ravel()
+        along = commanded_travel(at, travel)
+        joints = np.stack([np.interp(along, travel, column) for column in motion.joints.T], axis=1)
+        since = START_NS * 1e-9 + motion.start_s
+        lines += [
+            f"{since + t:.6f}," + ",".join(f"{v:.9f}" for v in row)
+            for t, row in zip(at, joints, strict=True)
+        ]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 @pytest.mark.parametrize("own", [False, True])
 def test_joints_stand_for_poses(
     plan: RobotPlan,
@@ -85,21 +107,7 @@ def test_joints_stand_for_poses(
     streams = streams_of([thin(t) for t in played], plan)
     streams[POSE.name] = []
     record = write(streams, tmp_path / "r.mcap")
-    log = tmp_path / "left.csv"
-    lines = ["time_s," + ",".join(arm.joint_names)]
-    for motion in plan.motions:
-        assert motion.joints is not None
-        travel = motion.trajectory.travel_m
-        near = np.concatenate([np.arange(7), np.arange(493, 500)]) / 100
-        at = (5.0 * np.arange(len(travel) - 1)[:, None] + near).ravel()
-        along = commanded_travel(at, travel)
-        joints = np.stack([np.interp(along, travel, column) for column in motion.joints.T], axis=1)
-        since = START_NS * 1e-9 + motion.start_s
-        lines += [
-            f"{since + t:.6f}," + ",".join(f"{v:.9f}" for v in row)
-            for t, row in zip(at, joints, strict=True)
-        ]
-    log.write_text("\n".join(lines) + "\n")
+    log = joint_log(plan.motions, arm, tmp_path / "left.csv")
     shifted = stand_in.sensor_robot("left")
     shifted = Transform(shifted.rotation, shifted.translation + ERROR_M)
     back = ingest_experiment(
@@ -120,6 +128,31 @@ def test_joints_stand_for_poses(
         )
     with pytest.raises(DatasetError, match="no pose stream"):
         ingest_experiment(record, plan_file, unit="u", sensor="finger", start_wall_ns=START_NS)
+
+
+def test_of_two_arms_one_may_publish_its_pose(
+    two_arms: RobotPlan, bases: dict[str, ArmBase], tmp_path: Path
+) -> None:
+    streams = streams_of([thin(trial) for trial in play(two_arms)], two_arms)
+    first, second = two_arms.motions
+    assert (first.trajectory.arm, second.trajectory.arm) == ("left", "right")
+    between_ns = START_NS + round(second.start_s * 1e9)
+    streams[POSE.name] = [p for p in streams[POSE.name] if p.stamp.wall_ns < between_ns]
+    record = write(streams, tmp_path / "r.mcap")
+    right = bases["right"].arm
+    assert right is not None
+    log = joint_log([second], right, tmp_path / "right.csv")
+    back = ingest_experiment(
+        record,
+        write_trajectories(two_arms, tmp_path / "plan.jsonl"),
+        unit="biotac-1",
+        sensor="finger",
+        start_wall_ns=START_NS,
+        joint_logs={"right": JointLog(log, right)},
+    )
+    for trial, motion, error_m in zip(back, two_arms.motions, (ERROR_M, np.zeros(3)), strict=True):
+        off = trial.tip[trial.increment_end] - motion.trajectory.poses[1:, :3] - error_m
+        assert np.linalg.norm(off, axis=1).max() < 0.06e-3  # repeatability of the virtual robot
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,31 @@ def exchange(streams: Streams) -> None:
     )
 
 
+def overload_all(streams: Streams) -> None:
+    wrenches = streams[WRENCH.name]
+    wrenches[:] = [replace(w, overload=True) for w in wrenches if isinstance(w, WrenchFrame)]
+
+
+def other_host(streams: Streams) -> None:
+    """Wrenches come from a host whose wall clock is a day late."""
+    for i, one in enumerate(wrenches := streams[WRENCH.name]):
+        late = one.stamp.wall_ns - 86_400_000_000_000
+        stamp = replace(one.stamp, monotonic_ns=i + 1, wall_ns=late, clock_id=8)
+        wrenches[i] = replace(one, stamp=stamp)
+
+
+def rename_from(increment: int, indenter: str) -> Callable[[Streams], None]:
+    """Another indenter is told from an increment of the first trajectory on."""
+
+    def change(streams: Streams) -> None:
+        end = START_NS + increment * 5_000_000_000
+        for i, pose in enumerate(poses := streams[POSE.name]):
+            if isinstance(pose, IndenterPoseFrame) and pose.stamp.wall_ns > end:
+                poses[i] = replace(pose, indenter=indenter)
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "match"),
     [
@@ -110,7 +135,10 @@ def exchange(streams: Streams) -> None:
         (move_tip(0, -0.25e-3), "at the start the tip is 0.2"),
         (move_tip(7, 0.25e-3), "end of increment 7 the tip is 0.2"),
         (move_tip(31, 0.2e-3, onward=True), r"'s/00/normal': at the end of increment 3[12] "),
-        (move_tip(1, 9e-3, onward=True), "'s/00/normal': the tip is .* mm from every command"),
+        (move_tip(1, 9e-3, onward=True), "'s/00/normal': the tip of the left arm is .* mm from"),
+        (overload_all, "at no frame of sensor 'finger' is the force known"),
+        (other_host, "at no frame of sensor 'finger' is the force known"),
+        (rename_from(2, "t"), "'s/00/normal' is of the indenter 's', its poses of 't'"),
     ],
 )
 def test_what_a_record_lacks_is_named(

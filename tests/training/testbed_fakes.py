@@ -72,17 +72,22 @@ def plan_file(plan: RobotPlan, tmp_path_factory: pytest.TempPathFactory) -> Path
 @pytest.fixture(scope="module")
 def played(plan: RobotPlan) -> list[RawTrial]:
     """The plan on a virtual finger, by a robot that stands wrong."""
-    travel = np.linspace(0, 0.2e-3, 3)
+    return play(plan)
+
+
+def play(plan: RobotPlan) -> list[RawTrial]:
+    """A plan on a virtual finger, by robots that stand wrong."""
     trials = []
     for seed, motion in enumerate(plan.motions):
         item = motion.trajectory
+        travel = np.linspace(0, item.depth_m, 3)
         trials.append(
             perform(
                 TrialHeader("biotac-1", item.trajectory, item.indenter, item.arm),
                 travel_m=travel,
                 force=np.outer(travel, [0.0, 2e3, 1e4]),
                 counts=3000 - np.outer(travel, np.linspace(0, 4e6, 19)),
-                tip=item.target + travel[:, None] * item.direction,
+                tip=item.target + (item.contact_m + travel[:, None]) * item.direction,
                 read_electrodes=lambda ideal, _: np.rint(ideal).astype(np.uint16),
                 registration_error_m=ERROR_M,
                 seed=seed,
@@ -126,7 +131,9 @@ def streams_of(trials: list[RawTrial], plan: RobotPlan) -> Streams:
                 WrenchFrame(stamp, "ft", force.astype(np.float32), np.zeros(3, np.float32))
             )
             streams[POSE.name].append(
-                IndenterPoseFrame(stamp, "s", tip, np.array([1.0, 0.0, 0.0, 0.0]))
+                IndenterPoseFrame(
+                    stamp, motion.trajectory.indenter, tip, np.array([1.0, 0.0, 0.0, 0.0])
+                )
             )
     return streams
 

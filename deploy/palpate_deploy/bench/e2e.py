@@ -231,7 +231,7 @@ def _values(
         },
         "e2e.runs": [run.plain() for run in runs],
         **{f"load.{load.service}": load.plain() for load in loads},
-        "load.goal_met": all(load.lost == 0 for load in loads),
+        "load.goal_met": all(load.met for load in loads),
         "first_loss": None if first_loss is None else first_loss.plain(),
     }
 

@@ -129,6 +129,10 @@ class History:
         self.pids.append(pid)
         self.uses.append(use)
 
+    def samples_since(self, since_s: float) -> int:
+        """How many samples there are from a time on."""
+        return len(self.times_s) - int(np.searchsorted(self.times_s, since_s))
+
     def growth(self, since_s: float) -> Growth:
         """How it develops after ``since_s``, which is the end of the warm-up.
 
@@ -181,5 +185,9 @@ def verdict_of(slope: float, half: float) -> Verdict:
 
 
 def growths(histories: Mapping[str, History], since_s: float) -> dict[str, Growth]:
-    """Growth of each process, in order of names."""
-    return {name: history.growth(since_s) for name, history in sorted(histories.items())}
+    """Growth of each process, in order of names; without those that were there too short a time."""
+    return {
+        name: history.growth(since_s)
+        for name, history in sorted(histories.items())
+        if history.samples_since(since_s) >= 2 * BINS
+    }

@@ -110,6 +110,9 @@ def account(
 
     ``before`` holds the gateway's counters at the beginning, ``looks`` its status during the run,
     the last one at the end; the files hold the client's rows and the bare reader's result.
+
+    Raises:
+        LinkError: No frame of one kind came to the client, or nothing of a device to the reader.
     """
     names, rows, lost = read_rows(rows_file)
     # Selected by arrival, so that frames still on their way at the end do not count as lost.
@@ -127,6 +130,11 @@ def account(
     electrodes = late_s[of_finger[rows[:, 0]]]
     p50, p99 = np.percentile(electrodes, (50, 99))
     with np.load(floor_file, allow_pickle=False) as archive:
+        if not (heard := archive["heard"]).all():
+            raise LinkError(
+                f"the bare reader received from {heard.sum()} of {len(heard)} devices",
+                remedy="see the emulators' logs: without its load there is nothing to compare with",
+            )
         floor_p50, floor_p99 = np.percentile(archive["late_s"], (50, 99))
         floor_core = float(archive["core"])
     told = {

@@ -71,6 +71,8 @@ def client(endpoint: str, station: str, out: Path) -> None:
 def floor(out: Path, plan_json: str) -> None:
     """Read the devices of a plan for a while, a thread for each, and write delays and CPU time.
 
+    Also of each device whether anything was received.
+
     The plan holds ``seconds``, and the addresses of ``buses``, ``sockets`` and ``lines``.
     """
     import can
@@ -81,6 +83,7 @@ def floor(out: Path, plan_json: str) -> None:
     until_s = time.monotonic() + plan["seconds"]
     offset_s = time.time() - time.monotonic()
     lates = [array("d") for _ in plan["buses"]]
+    heard: set[Any] = set()
 
     def read_bus(options: dict[str, Any], late: array[float]) -> None:
         with can.Bus(**options) as bus:
@@ -93,13 +96,15 @@ def floor(out: Path, plan_json: str) -> None:
         with socket.create_connection((host, port), timeout=2.0) as link:
             link.sendall(b"L1()\n")
             while time.monotonic() < until_s:
-                link.recv(65536)
+                if link.recv(65536):
+                    heard.add(port)
 
     def read_line(line: str, baud: int) -> None:
         with serial.Serial(line, baud, timeout=0.1) as port:
             port.write(b"R")
             while time.monotonic() < until_s:
-                port.read(max(1, port.in_waiting))
+                if port.read(max(1, port.in_waiting)):
+                    heard.add(line)
 
     threads = [
         *(
@@ -119,6 +124,13 @@ def floor(out: Path, plan_json: str) -> None:
         out,
         late_s=np.concatenate([np.array(late) for late in lates]),
         core=np.float64((time.process_time() - used_s) / elapsed_s),
+        heard=np.array(
+            [
+                *(len(late) > 0 for late in lates),
+                *(key in heard for _, key in plan["sockets"]),
+                *(key in heard for key, _ in plan["lines"]),
+            ]
+        ),
     )
 
 

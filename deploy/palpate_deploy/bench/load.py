@@ -49,6 +49,7 @@ class LoadResult:
     ``published`` counts the tared frames, which need an estimate, by the gateway's counters;
     ``reached_hz`` is the rate of a finger that the gateway reached, ``received`` the estimates in
     the client, ``lost_at`` lost frames by place and reason; the percentiles are ages there [s].
+    ``silent`` counts the fingers without any estimate there, e.g. for want of a tare.
     ``cores`` are the shares of a core that the processes took while frames were sent, and
     ``stages_s`` the medians of the estimates' stages [s].
     """
@@ -64,6 +65,12 @@ class LoadResult:
     p99_s: float = 0.0
     cores: dict[str, float] = field(default_factory=dict)
     stages_s: dict[str, float] = field(default_factory=dict)
+    silent: int = 0
+
+    @property
+    def met(self) -> bool:
+        """Whether every finger got estimates, and none was lost."""
+        return self.lost == 0 and self.silent == 0
 
     @property
     def lost(self) -> int:
@@ -83,6 +90,7 @@ class LoadResult:
             f"({self.reached_hz * self.sensors:,.0f} frames/s sent): "
             f"{self.lost} of {self.published:,} frames lost"
             + (f" ({where})" if where else "")
+            + (f", {self.silent} fingers without any estimate" if self.silent else "")
             + f", p50 {self.p50_s * 1e3:.2f} ms, p99 {self.p99_s * 1e3:.2f} ms",
             "  cores: " + ", ".join(f"{name} {share:.2f}" for name, share in self.cores.items()),
             *([f"  median stages [ms]: {stages}"] if stages else []),
@@ -91,7 +99,7 @@ class LoadResult:
 
 def ramp_rate(base: LoadResult, *, bundle: str, bar: Progress) -> LoadResult | None:
     """Raise the rate from the base's until a frame is lost; None if none ever is."""
-    if base.lost:
+    if not base.met:
         return base
     rate_hz = base.rate_hz * _STEP
     while rate_hz <= _RATE_MAX_HZ:
@@ -103,7 +111,7 @@ def ramp_rate(base: LoadResult, *, bundle: str, bar: Progress) -> LoadResult | N
             bundle=bundle,
             bar=bar,
         )
-        if result.lost:
+        if not result.met:
             return result
         rate_hz *= _STEP
     return None
@@ -208,6 +216,7 @@ def _account(
         float(p99),
         cores,
         stage_medians(rows),
+        silent=sensors - len(np.unique(names)),
     )
 
 

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,9 @@ class SoakResult:
         fingers: Virtual fingers.
         processes: Growth by process.
         received: Messages that the client got, by topic.
-        lost: What the client missed, and what any process counted as lost, both after the warm-up.
+        lost: What the client missed, and what any process counted as lost, both after the warm-up;
+            and 1 for each stream of a finger of which nothing came, and each process that was not
+            there all the time.
         disk_peak_mb: Most that records and views took [MB]; ``disk_limit_mb`` is what the settings
             allow: what is kept, and the record that is being written with its view.
         disk_mb_per_h: What the recorder wrote in an hour, with the views [MB/h].
@@ -115,7 +118,7 @@ class _Client:
     """A robot's client that takes every message of all fingers, in threads of its own."""
 
     def __init__(self, session: Session) -> None:
-        self.received: Counter[str] = Counter()
+        self.received: Counter[tuple[str, str]] = Counter()  # by topic and sensor
         self.begun_s = time.monotonic()
         self._holes = 0
         self._first: dict[str, int] = {}
@@ -149,7 +152,7 @@ class _Client:
                 hole = sequence - self._answered.get(sensor, sequence - 1) - 1
                 self._holes += max(hole, 0)
                 self._answered[sensor] = sequence
-            self.received[name] += 1
+            self.received[name, sensor] += 1
 
     def lost(self) -> Counter[str]:
         """What did not arrive, by topic and cause; fields and syntheses are of some frames only."""
@@ -265,6 +268,7 @@ class _Watch:
         self._warm_up_s = warm_up_s
         self._begun_s = time.monotonic()
         self._before: Counter[str] | None = None
+        self._received_before: Counter[tuple[str, str]] = Counter()
         self._totals()  # the first question takes a megabyte of each process, which is no growth
 
     def look(self) -> float:
@@ -277,6 +281,7 @@ class _Watch:
         self.disk.append((now_s, _size(self._profile.recorder.out)))
         if self._before is None and now_s >= self._warm_up_s:
             self._before = self._losses(self._totals())
+            self._received_before = self._client.received.copy()
         return now_s
 
     def result(self, fingers: int) -> SoakResult:
@@ -284,15 +289,26 @@ class _Watch:
         totals = self._totals()
         lost = self._losses(totals)
         lost.subtract(self._before or Counter())
+        received = self._client.received.copy()
+        names = [sensor.name for sensor in self._profile.gateway.sensors]
+        for key in product((topic.name for topic in _TOPICS), names):
+            lost[f"client all {key[0]} of {key[1]}"] += received[key] <= self._received_before[key]
         seconds, size = self.disk[-1]
+        processes = growths(self.histories, self._warm_up_s)
+        for name, history in self.histories.items():
+            there = name in processes and history.times_s[-1] >= seconds
+            lost[f"{name} not there all the time"] += not there
+        by_topic: Counter[str] = Counter()
+        for (name, _), count in received.items():
+            by_topic[name] += count
         written = size + totals["recorder removed_bytes"]
         recorder = self._profile.recorder
         return SoakResult(
             minutes=seconds / 60.0,
             warm_up_minutes=self._warm_up_s / 60.0,
             fingers=fingers,
-            processes=growths(self.histories, self._warm_up_s),
-            received=dict(self._client.received),
+            processes=processes,
+            received=dict(by_topic),
             lost={name: count for name, count in sorted(lost.items()) if count > 0},
             disk_peak_mb=max(size for _, size in self.disk) / MEGABYTE,
             # Old records are removed when a new one begins: it and its view come on top.

@@ -68,6 +68,7 @@ def bad_sequences(seconds: float) -> tuple[bool, Figures]:
             frame = replace(good, stamp=stamp)
             stranger.put(key, ELECTRODE_FRAME.encode(frame), encoding=encoding)
 
+        before = station.refusals()
         mark = station.observer.mark()
         sent: Counter[str] = Counter()
         kinds: dict[str, tuple[int, int]] = {
@@ -100,7 +101,8 @@ def bad_sequences(seconds: float) -> tuple[bool, Figures]:
         "disordered": account.disordered,
         **account.figures(),
     }
-    return account.lost <= sum(sent.values()) and account.forged == 0, figures
+    told = refused != before
+    return account.lost <= sum(sent.values()) and account.forged == 0 and told, figures
 
 
 def hostile_payloads(seconds: float) -> tuple[bool, Figures]:
@@ -154,7 +156,7 @@ def hostile_payloads(seconds: float) -> tuple[bool, Figures]:
         "features_grew_bytes": grew,
         **account.figures(),
     }
-    return account.lost <= 0.01 * account.received and grew < 16 << 20, figures
+    return account.lost <= 0.01 * account.received and grew < 16 << 20 and told > 0, figures
 
 
 def reply_code(reply: zenoh.Reply) -> str:

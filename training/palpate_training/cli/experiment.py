@@ -114,7 +114,9 @@ def data_ingest(
     ] = None,
     joints: Annotated[
         list[str] | None,
-        typer.Option(metavar="ARM=LOG.csv", help="Joint angles instead of poses; repeatable."),
+        typer.Option(
+            metavar="ARM=LOG.csv", help="An arm's joint angles instead of poses; repeatable."
+        ),
     ] = None,
     urdf: UrdfOption = None,
     tip_frame: TipFrameOption = None,

@@ -224,11 +224,18 @@ def tables_of(values: Mapping[str, Any]) -> Iterator[Table]:
                     row["test"],
                     row["system"],
                     _force_range(row["least_n"], row["most_n"]),
-                    f"{row['ratio']:.2f} ({row['interval'][0]:.2f}-{row['interval'][1]:.2f})",
+                    _ratio(row),
                 )
                 for row in ratios
             ),
         )
+
+
+def _ratio(row: Row) -> str:
+    """The ratio with its interval; a test may have no row in the range of forces."""
+    if row["ratio"] is None:
+        return "-"
+    return f"{row['ratio']:.2f} ({row['interval'][0]:.2f}-{row['interval'][1]:.2f})"
 
 
 def _force_range(least_n: float, most_n: float | None) -> str:

@@ -57,6 +57,16 @@ class _AlignedSamples:
     force: Floats
 
 
+@dataclass(frozen=True, slots=True)
+class _Tip:
+    """Where the tip was at each sample, where that is known, and what each pose said it was of."""
+
+    position: Floats
+    known: npt.NDArray[np.bool_]
+    pose_ns: Times
+    indenters: npt.NDArray[np.str_]
+
+
 def ingest_experiment(
     record: Path,
     plan: Path,
@@ -75,12 +85,13 @@ def ingest_experiment(
         sensor: Name of the sensor in the record's keys.
         start_wall_ns: Wall clock when the plan started, or by trajectory when it started; with a
             mapping, trajectories that are not in it were not executed.
-        joint_logs: By arm; None = poses come from the record.
+        joint_logs: By arm; the tip of an arm without one is by the poses of the record.
 
     Raises:
         RecordingError: Not a whole record.
-        DatasetError: A stream is missing, the schedule does not match, or there is a gap of more
-            than 50 ms at the end of an increment; names the trajectory and increment.
+        DatasetError: A stream is missing, the poses are of another indenter, the schedule does not
+            match, or there is a gap of more than 50 ms at the end of an increment; names the
+            trajectory and increment.
         ConfigError: Joints that the arm cannot have.
     """
     planned = read_trajectories(plan)
@@ -91,26 +102,27 @@ def ingest_experiment(
         )
     samples = _samples(record, sensor, streams)
     starts = _starts(plan, planned.motions, start_wall_ns)
-    tips: dict[str, tuple[Floats, npt.NDArray[np.bool_]]] = {}
+    logs = joint_logs or {}
+    tips: dict[str, _Tip] = {}
     trials = []
     for motion in planned.motions:
         item = motion.trajectory
         if item.trajectory not in starts:
             continue
         if item.arm not in tips:
-            if joint_logs is None:
-                tips[item.arm] = _tip_of_poses(record, sensor, streams, samples)
-            elif item.arm in joint_logs:
+            if item.arm in logs:
                 registered = planned.bases[item.arm].sensor_robot
-                tips[item.arm] = _tip_of_joints(joint_logs[item.arm], registered, samples)
+                tips[item.arm] = _tip_of_joints(logs[item.arm], registered, samples)
+            elif streams.poses or joint_logs is None:
+                tips[item.arm] = _tip_of_poses(record, sensor, streams, samples)
             else:
                 raise DatasetError(
                     f"{plan}: {item.trajectory!r} was executed by the {item.arm} arm, which has no"
                     " joint log",
                     remedy="pass the joint log of every arm of the plan",
                 )
-        tip, known = tips[item.arm]
-        trials.append(_cut(record, motion, unit, starts[item.trajectory], samples, tip, known))
+        start_ns = starts[item.trajectory]
+        trials.append(_cut(record, motion, unit, start_ns, samples, tips[item.arm]))
     return trials
 
 
@@ -127,6 +139,12 @@ def _samples(record: Path, sensor: str, streams: SensorStreams) -> _AlignedSampl
     frames = [frames[i] for i in first]
     at = times + middles(frames)
     force, known, _ = force_at(record, sensor, at, streams, clock)
+    if not known.any():
+        raise DatasetError(
+            f"{record}: at no frame of sensor {sensor!r} is the force known",
+            remedy="the clocks of their hosts differ by more than the record lasts (docs/time.md),"
+            " or the force/torque sensor was overloaded all the time: record again",
+        )
     walls = np.array([frame.stamp.wall_ns for frame in frames], dtype=np.int64)
     return _AlignedSamples(
         at[known],
@@ -138,29 +156,27 @@ def _samples(record: Path, sensor: str, streams: SensorStreams) -> _AlignedSampl
 
 def _tip_of_poses(
     record: Path, sensor: str, streams: SensorStreams, samples: _AlignedSamples
-) -> tuple[Floats, npt.NDArray[np.bool_]]:
+) -> _Tip:
     if not streams.poses:
         raise DatasetError(
             f"{record}: sensor {sensor!r} has no pose stream",
             remedy="record the indenter's pose, or pass the joint log of each arm",
         )
-    return linear(
-        samples.time_ns,
-        times_of(streams.poses, streams.clock),
-        np.array([p.position for p in streams.poses], dtype=np.float64),
-    )
+    times = times_of(streams.poses, streams.clock)
+    positions = np.array([p.position for p in streams.poses], dtype=np.float64)
+    indenters = np.array([p.indenter for p in streams.poses])
+    return _Tip(*linear(samples.time_ns, times, positions), times, indenters)
 
 
-def _tip_of_joints(
-    log: JointLog, registered: Transform, samples: _AlignedSamples
-) -> tuple[Floats, npt.NDArray[np.bool_]]:
+def _tip_of_joints(log: JointLog, registered: Transform, samples: _AlignedSamples) -> _Tip:
     times, joints = read_joint_log(log.path, log.arm)
     try:
         positions, _ = log.arm.tip(joints)
     except ConfigError as error:
         raise ConfigError(f"{log.path}: {error.problem}", remedy=error.remedy) from error
     sensor_robot = registered if log.sensor_robot is None else log.sensor_robot
-    return linear(samples.wall_ns, times, sensor_robot.apply(positions))
+    found = linear(samples.wall_ns, times, sensor_robot.apply(positions))
+    return _Tip(*found, np.empty(0, np.int64), np.empty(0, np.str_))
 
 
 def _starts(
@@ -186,8 +202,7 @@ def _cut(
     unit: str,
     start_ns: int,
     samples: _AlignedSamples,
-    tip: Floats,
-    known: npt.NDArray[np.bool_],
+    tip: _Tip,
 ) -> RawTrial:
     """One trial: the samples from its start to its end that have everything."""
     item = motion.trajectory
@@ -195,11 +210,19 @@ def _cut(
     # The wall clock gives the start; after it the monotonic clock is used, which never jumps.
     first = int((samples.wall_ns >= start_ns).argmax())
     since_ns = samples.time_ns - samples.time_ns[first] + samples.wall_ns[first] - start_ns
-    kept = np.flatnonzero(known & (since_ns >= 0) & (since_ns < round(item.duration_s * 1e9)))
+    kept = np.flatnonzero(tip.known & (since_ns >= 0) & (since_ns < round(item.duration_s * 1e9)))
     if not len(kept):
         raise DatasetError(
             f"{where}: nothing was recorded in its {item.duration_s:g} s",
             remedy="check the start time: wall clock, in nanoseconds; leave out what was not run",
+        )
+    begun_ns, ended_ns = samples.time_ns[kept[[0, -1]]]
+    named = tip.indenters[(tip.pose_ns >= begun_ns) & (tip.pose_ns <= ended_ns)]
+    if others := set(named.tolist()) - {item.indenter}:
+        raise DatasetError(
+            f"{where} is of the indenter {item.indenter!r}, its poses of {sorted(others)[0]!r}",
+            remedy="if another indenter was on the robot, leave this trajectory out by"
+            " start_wall_ns; if only the pose's option indenter was wrong, pass the joint log",
         )
     time_s = since_ns[kept] * 1e-9
     if time_s[0] > GAP_S:
@@ -220,32 +243,35 @@ def _cut(
             " leave this trajectory out by start_wall_ns",
         )
     stops = kept[np.concatenate([[0], last])]
-    _check_schedule(where, tip[stops] - item.poses[:, :3])
+    _check_schedule(where, item.arm, tip.position[stops] - item.poses[:, :3])
     return RawTrial(
         header=TrialHeader(unit, item.trajectory, item.indenter, item.arm),
         time_s=time_s,
         electrodes=samples.electrodes[kept],
         force=samples.force[kept],
-        tip=tip[kept],
+        tip=tip.position[kept],
         travel_m=commanded_travel(time_s, item.travel_m),
         increment_end=last.astype(np.int64),
     )
 
 
-def _check_schedule(where: str, missed: Floats) -> None:
+def _check_schedule(where: str, arm: str, missed: Floats) -> None:
     """Compare tip and command where it starts and at the ends of increments.
 
     A schedule that is early by a whole increment shows at the start, one that is late at the end.
 
     Args:
         where: For the message.
+        arm: Which arm's tip, for the message.
         missed: Tip minus command [m], shape (I + 1, 3).
     """
     shared = np.median(missed, axis=0)  # by registration, as the fingertip sees it
     if np.linalg.norm(shared) > OFFSET_M:
         raise DatasetError(
-            f"{where}: the tip is {np.linalg.norm(shared) * 1e3:.1f} mm from every command",
-            remedy="check the start time, and that pose and plan have one registration and tip",
+            f"{where}: the tip of the {arm} arm is {np.linalg.norm(shared) * 1e3:.1f} mm from"
+            " every command",
+            remedy="check the start time, that pose and plan have one registration and tip, and"
+            " that the poses are of this arm: where two arms press, pass the other's joint log",
         )
     off = np.linalg.norm(missed - shared, axis=1)
     if off.max() > MISMATCH_M:

@@ -248,7 +248,8 @@ class SharedExperiment(Generic[Summary]):
                     if isinstance(news, tuple):
                         on_stage(*news)
                         continue
-                    idle.append(maker)
+                    if maker not in idle:  # one may die while it waits
+                        idle.append(maker)
                     if isinstance(news, PalpateError):
                         failure = failure or news
                     elif news.summary is not None:

@@ -58,6 +58,9 @@ TEMPERATURE_WALK_K = 0.03
 """Random walk of the core's temperature: standard deviation of what it gains in one minute [K]."""
 
 SUFFIX = ".npz"
+FINGERTIP = "fingertip.txt"
+"""Digest of the fingertip whose simulation the trials of a folder are of."""
+
 ROW_ARRAYS = ("rest", "travel_m", "tared", "force", "location")
 
 
@@ -80,9 +83,11 @@ def make_trials(
         Whether all are there; False = stopped.
 
     Raises:
-        DatasetError: The store is damaged, or the disk refuses.
+        DatasetError: The store is damaged, the folder holds trials of another fingertip, or the
+            disk refuses.
     """
     fingertip = store.fingertip()
+    _keep_fingertip(folder, fingertip.key, store.path)
     there = set(store.ids())
     every: list[PlannedTrajectory | PlannedManipulation] = [
         *simulator.plans(spec, fingertip),
@@ -114,6 +119,27 @@ def make_trials(
             if stop.is_set():
                 break
     return done == len(plans)
+
+
+def _keep_fingertip(folder: Path, key: str, store: Path) -> None:
+    """Write of which fingertip the trials are, or compare it with what is there."""
+    path = folder / FINGERTIP
+    try:
+        found = path.read_bytes()
+    except FileNotFoundError:
+        with written_whole(path) as part:
+            part.write_text(key, encoding="utf-8")
+        return
+    except OSError as error:
+        raise DatasetError(
+            f"{path} cannot be read: {error.strerror or error}",
+            remedy="check the folder's rights, or name another",
+        ) from error
+    if found != key.encode():
+        raise DatasetError(
+            f"{folder} holds trials of another fingertip than {store} simulates",
+            remedy=f"remove {folder} and run the command again: they are made again",
+        )
 
 
 def read_trials(folder: Path, name: str) -> TrialsDone:
