@@ -138,7 +138,7 @@ def rename_from(increment: int, indenter: str) -> Callable[[Streams], None]:
         (move_tip(1, 9e-3, onward=True), "'s/00/normal': the tip of the left arm is .* mm from"),
         (overload_all, "at no frame of sensor 'finger' is the force known"),
         (other_host, "at no frame of sensor 'finger' is the force known"),
-        (rename_from(2, "t"), "'s/00/normal' is of the indenter 's', its poses of 't'"),
+        (rename_from(2, "t"), "'s/00/normal' is of the indenter 's', its poses of s and t"),
     ],
 )
 def test_what_a_record_lacks_is_named(
@@ -154,6 +154,22 @@ def test_what_a_record_lacks_is_named(
     record = write(streams, tmp_path / "r.mcap")
     with pytest.raises(DatasetError, match=rf"r\.mcap.*{match}"):
         ingest_experiment(record, plan_file, unit="u", sensor="finger", start_wall_ns=START_NS)
+
+
+def test_another_name_of_the_indenter_is_told_and_no_trouble(
+    plan: RobotPlan,
+    plan_file: Path,
+    played: list[RawTrial],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """As ``sphere_7mm`` in a pose's options, of which a plan says ``sphere_medium``."""
+    streams = streams_of(played, plan)
+    rename_from(-1, "t")(streams)
+    record = write(streams, tmp_path / "r.mcap")
+    found = ingest_experiment(record, plan_file, unit="u", sensor="finger", start_wall_ns=START_NS)
+    assert len(found) == len(played)
+    assert "'s/00/normal' is of the indenter 's', its poses of 't'" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ command.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,8 @@ from palpate_training.datasets.trials import RawTrial, TrialHeader
 from palpate_training.experiment.kinematics import ArmKinematics
 from palpate_training.experiment.plan import DWELL_S, ArmMotion, commanded_travel
 from palpate_training.experiment.trajectory_file import read_trajectories
+
+_log = logging.getLogger(__name__)
 
 GAP_S = 0.05
 """How old the last sample of an increment may be at its end [s]: five frames at 100 Hz."""
@@ -89,9 +92,9 @@ def ingest_experiment(
 
     Raises:
         RecordingError: Not a whole record.
-        DatasetError: A stream is missing, the poses are of another indenter, the schedule does not
-            match, or there is a gap of more than 50 ms at the end of an increment; names the
-            trajectory and increment.
+        DatasetError: A stream is missing, the poses of a trajectory are of two indenters, the
+            schedule does not match, or there is a gap of more than 50 ms at the end of an
+            increment; names the trajectory and increment.
         ConfigError: Joints that the arm cannot have.
     """
     planned = read_trajectories(plan)
@@ -218,12 +221,7 @@ def _cut(
         )
     begun_ns, ended_ns = samples.time_ns[kept[[0, -1]]]
     named = tip.indenters[(tip.pose_ns >= begun_ns) & (tip.pose_ns <= ended_ns)]
-    if others := set(named.tolist()) - {item.indenter}:
-        raise DatasetError(
-            f"{where} is of the indenter {item.indenter!r}, its poses of {sorted(others)[0]!r}",
-            remedy="if another indenter was on the robot, leave this trajectory out by"
-            " start_wall_ns; if only the pose's option indenter was wrong, pass the joint log",
-        )
+    _check_indenter(where, item.indenter, sorted(set(named.tolist())))
     time_s = since_ns[kept] * 1e-9
     if time_s[0] > GAP_S:
         raise DatasetError(
@@ -253,6 +251,23 @@ def _cut(
         travel_m=commanded_travel(time_s, item.travel_m),
         increment_end=last.astype(np.int64),
     )
+
+
+def _check_indenter(where: str, planned: str, named: Sequence[str]) -> None:
+    """Refuse poses of two indenters; the names of one may differ, as an indenter may have two."""
+    if len(named) > 1:
+        raise DatasetError(
+            f"{where} is of the indenter {planned!r}, its poses of {' and '.join(named)}",
+            remedy="if the indenter was changed meanwhile, leave this trajectory out by"
+            " start_wall_ns; else pass the joint log",
+        )
+    if named and named[0] != planned:
+        _log.warning(
+            "%s is of the indenter %r, its poses of %r: see that these are two names of one",
+            where,
+            planned,
+            named[0],
+        )
 
 
 def _check_schedule(where: str, arm: str, missed: Floats) -> None:
