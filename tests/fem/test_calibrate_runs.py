@@ -5,6 +5,8 @@ from __future__ import annotations
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -68,6 +70,29 @@ def test_a_refused_run_is_that_runs_trouble_only() -> None:
     assert (len(bad.forces), bad.outcome) == (0, IndentationOutcome.DIVERGED)
     assert "no such indenter" in bad.reason
     assert len(good.forces) == 5
+
+
+class Stub:
+    """A pressurised finger whose force grows by 1 N from step to step."""
+
+    total_thickness_m, fluid_volume_m3 = 15.1e-3, 8e-7
+    parameters = TRUTH
+
+    def indent(self, indenter: object, path: Floats, history: object) -> IndentationResult:
+        steps = cast("Any", [SimpleNamespace(force=np.array([0, 0, k])) for k in range(1, 5)])
+        return IndentationResult("cube", path, tuple(steps), IndentationOutcome.COMPLETE)
+
+
+def test_a_run_that_cannot_be_derived_keeps_its_forces(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise SimulationError("the linearised equations are not solved", remedy="none")
+
+    monkeypatch.setattr("palpate_fem.calibration.runs._filled", lambda *_: Stub())
+    monkeypatch.setattr("palpate_fem.calibration.runs.sensitivities", fail)
+    (run,) = SimulationRuns(FingertipSimulator()).run([(TRUTH, press())], (FRICTION,))
+    assert (run.outcome, run.reason) == (IndentationOutcome.COMPLETE, "")
+    np.testing.assert_array_equal(run.forces[:, 2], np.arange(5))
+    assert run.slopes is None
 
 
 def test_a_solvers_steps_begin_at_the_second_pose() -> None:

@@ -142,7 +142,7 @@ class SlopeSimulator(Simulator, Protocol):
         path: Floats,
         names: tuple[str, ...],
     ) -> SimulatedRun:
-        """As `simulate`, with derivatives by these parameters."""
+        """As `simulate`, with derivatives by these parameters if there are any."""
         ...
 
 
@@ -176,6 +176,8 @@ class FingertipSimulator:
     ) -> SimulatedRun:
         """See `SlopeSimulator.simulate_slopes`.
 
+        A run that cannot be derived is returned without derivatives.
+
         Raises:
             SimulationError: The finger cannot be filled, or the indenter begins inside of it.
         """
@@ -189,7 +191,10 @@ class FingertipSimulator:
         )
         if not names or not result.steps:
             return run
-        found = sensitivities(tip, history, names)
+        try:
+            found = sensitivities(tip, history, names)
+        except SimulationError:
+            return run
         slopes = RunSlopes(
             names,
             np.concatenate([np.zeros((1, 3, len(names))), found.force]),
