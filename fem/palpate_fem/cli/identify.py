@@ -10,11 +10,12 @@ from __future__ import annotations
 import json
 import math
 import re
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from rich.progress import Progress
 
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.outputs import check_folder, check_output
+from palpate.process import end_with_parent
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, recover
@@ -193,11 +195,25 @@ def slope_simulator_for(
     if "mesh" in options:
         raise ConfigError("--slopes is for the parametric mesh", remedy="leave out --mesh")
     count, _ = workers_for(workers, jobs)
+    others = set(active_children())
     with (
-        ProcessPoolExecutor(count, mp_context=get_context("spawn")) as executor,
+        ProcessPoolExecutor(
+            count, mp_context=get_context("spawn"), initializer=_begin_worker
+        ) as executor,
         progress_bar() as bar,
     ):
-        yield FingertipSimulator(**options), executor, _SearchBar(bar)  # type: ignore[arg-type]
+        try:
+            yield FingertipSimulator(**options), executor, _SearchBar(bar)  # type: ignore[arg-type]
+        except BaseException:  # the executor would wait for runs that nobody needs
+            for worker in set(active_children()) - others:
+                worker.kill()
+            raise
+
+
+def _begin_worker() -> None:
+    # Ctrl-C is for the command, which ends its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
 
 
 class _SearchBar:
