@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 import typer
-from rich.markup import escape
 from rich.progress import Progress
 
 from palpate.errors import ConfigError, DatasetError
@@ -431,7 +430,7 @@ def fit_sensor_command(
     write_population(out, [member], source=source)
     print_table(
         ("", found.name),
-        [(escape(label), f"{of(fit.specimen):.3g}") for label, of in ELECTRICAL],
+        [(label, f"{of(fit.specimen):.3g}") for label, of in ELECTRICAL],
         title=f"fitted to the rest and {len(some)} of {len(found)} touches",
         numbers_from=1,
     )
@@ -495,7 +494,7 @@ def draw_units_command(count: int, seed: int, out: Path | None, *, as_json: bool
         ("", "5 %", "median", "95 %"),
         [
             (
-                escape(label),
+                label,
                 *(
                     f"{value:.3g}"
                     for value in np.percentile(
@@ -525,8 +524,7 @@ def _show_members(members: Sequence[Member]) -> None:
     ]
     print_table(
         ("", *(member.specimen.name for member in members)),
-        # Rich would take [N] for a style.
-        [(escape(label), *(value(member) for member in members)) for label, value in rows],
+        [(label, *(value(member) for member in members)) for label, value in rows],
         title="specimens: found (published)",
         numbers_from=1,
     )
