@@ -372,6 +372,16 @@ def test_a_recording_is_read_or_refused(tmp_path: Path) -> None:
             call()
 
 
+def test_a_recording_of_the_rest_will_do_where_no_touch_is_asked_for(tmp_path: Path) -> None:
+    rest = np.tile(REST, (100, 1))
+    path = write_recording(tmp_path / "rest.h5", rows_of=(REST, rest, np.zeros((100, 3))))
+    with pytest.raises(DatasetError, match="was held"):
+        read_touches(path)
+    touches = read_touches(path, rest_alone=True)
+    assert len(touches) == 0
+    np.testing.assert_array_equal(touches.rest, REST)
+
+
 def test_touches_are_tared_by_the_tare_that_was_in_force(tmp_path: Path) -> None:
     """The same dents, with one electrode near the converter's end, after each of two tares."""
     rest = np.repeat([2700.0, 2500.0], 120)[:, None] * np.ones(SENSING)

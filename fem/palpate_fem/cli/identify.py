@@ -127,8 +127,7 @@ def validate_command(
             simulated = simulate_all(
                 simulator, model.parameters, chosen, executor=executor, on_run=bar.on_run
             )
-    result = validate(chosen, simulated)
-    print_lines(*(f"{name}: {why}" for name, why in refused.items()))
+    result = validate(chosen, simulated, refused)
     if result.compared:
         print_table(INDENTER_HEADINGS, indenter_rows(result))
     print_lines(*summary_lines(result))
@@ -409,7 +408,7 @@ def fit_sensor_command(
     check_output(out, "--out", ".json", store, recording)
     if touches is not None and touches < 0:
         raise ConfigError(f"{touches} touches", remedy="give 0 for the rest alone, or more")
-    found = read_touches(recording, sensor=sensor, rows=held_rows)
+    found = read_touches(recording, sensor=sensor, rows=held_rows, rest_alone=touches == 0)
     some = found.some(slice(0, len(found) if touches is None else touches))
     opened = SimulationStore.open(store)
     model = ElectrodeModel(geometry_of(opened.fingertip()))
