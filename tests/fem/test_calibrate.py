@@ -427,6 +427,10 @@ def test_json_of_a_recovery_that_fails_is_json(monkeypatch: pytest.MonkeyPatch) 
     assert done.exit_code == 1
     told = json.loads(done.stdout, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
     assert told["found"][MODULUS] is None
+    oblique = ANGLED.name + "/virtual1"
+    force = next(item.force for item in found.measured if item.name == oblique)
+    largest = np.sqrt((force**2).sum(axis=1)).max()
+    assert told["largest_force_n"][oblique] == pytest.approx(largest)
     assert set(told["deviation"].values()) == {None}
 
 

@@ -45,6 +45,8 @@ class Spring:
     ) -> SimulatedRun:
         if indenter == "unknown":
             raise ConfigError("no such indenter", remedy="none")
+        if indenter == "defect":
+            raise ZeroDivisionError("somewhere")
         way = path_lengths(path)
         force = np.outer(way * parameters.shear_modulus_pa, np.array([0.0, 0.0, 1.0]))
         return SimulatedRun(force, way, 0.0151, 8e-7, IndentationOutcome.COMPLETE)
@@ -70,13 +72,20 @@ def test_each_run_is_made_once_whatever_the_sensor() -> None:
     assert runs.count == 4
 
 
-def test_a_refused_run_is_that_runs_trouble_only() -> None:
+@pytest.mark.parametrize(
+    ("indenter", "why", "traceback"),
+    [("unknown", "no such indenter", False), ("defect", "ZeroDivisionError: somewhere", True)],
+)
+def test_a_refused_run_is_that_runs_trouble_only(
+    indenter: str, why: str, traceback: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
     bad, good = SimulationRuns(Spring()).run(
-        [(TRUTH, replace(press(), indenter="unknown")), (TRUTH, press())]
+        [(TRUTH, replace(press(), indenter=indenter)), (TRUTH, press())]
     )
     assert (len(bad.forces), bad.outcome) == (0, IndentationOutcome.DIVERGED)
-    assert "no such indenter" in bad.reason
+    assert why in bad.reason
     assert len(good.forces) == 5
+    assert ("Traceback" in capsys.readouterr().err) is traceback
 
 
 class Stub:

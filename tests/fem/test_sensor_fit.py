@@ -467,3 +467,12 @@ def test_the_command_writes_a_population_that_the_twin_takes(tmp_path: Path) -> 
     assert "mine" in CliRunner().invoke(fem_app, ["units", "show", str(out)]).output
     refused = CliRunner().invoke(fem_app, [*command, "--touches", "-1"])
     assert isinstance(refused.exception, ConfigError)
+    mixed = np.clip(rest - 3.0 * (np.array(counts) - rest)[:, ::-1], 1.0, 4094.0)
+    for rows_of, asked, code, words in (
+        ((rest, mixed, np.array(force)), "3", 1, "do not explain the electrodes"),
+        ((rest, np.tile(rest, (9, 1)), np.zeros((9, 3))), "0", 0, "the rest and 0 of 0 touches"),
+    ):
+        write_recording(recorded, rows_of=rows_of)
+        done = CliRunner().invoke(fem_app, [*command, "--touches", asked], env={"COLUMNS": "100"})
+        assert done.exit_code == code, done.output
+        assert words in done.output

@@ -307,7 +307,9 @@ def _recovery_json(recovery: ParameterRecovery, noise_n: float, seed: int) -> di
         "planted": recovery.truth,
         "found": recovery.found,
         "error": recovery.errors,
-        "largest_force_n": {item.name: float(abs(item.force).max()) for item in recovery.measured},
+        "largest_force_n": {
+            item.name: float(np.linalg.norm(item.force, axis=1).max()) for item in recovery.measured
+        },
     }
 
 
@@ -403,8 +405,12 @@ def fit_units_command(store: Path, out: Path, *, overtravel_m: float | None) -> 
 
 def fit_sensor_command(
     store: Path, out: Path, recording: Path, *, sensor: str, touches: int | None, held_rows: int
-) -> None:
-    """Fit one specimen to a recorded sensor on a store of presses, and write it."""
+) -> int:
+    """Fit one specimen to a recorded sensor on a store of presses, and write it.
+
+    Returns:
+        1 if the presses do not explain the electrodes.
+    """
     check_output(out, "--out", ".json", store, recording)
     if touches is not None and touches < 0:
         raise ConfigError(f"{touches} touches", remedy="give 0 for the rest alone, or more")
@@ -446,6 +452,7 @@ def fit_sensor_command(
             "check that they are E1..E19 in order, raw and live"
         )
     print_lines(*lines, f"wrote {out}")
+    return 1 if fit.tells_nothing else 0
 
 
 def show_units_command(file: Path | None, *, as_json: bool) -> None:
