@@ -188,6 +188,23 @@ def stop_on_signals(*signals: signal.Signals) -> threading.Event:
     return stop
 
 
+def end_with_parent() -> None:
+    """Let a worker of `multiprocessing` end with the process that started it, also if killed.
+
+    Otherwise it would wait for its next task for ever.
+    """
+    from multiprocessing import parent_process  # of use to few processes
+
+    parent = parent_process()
+    assert parent is not None
+
+    def wait_for_end() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait_for_end, name="parent", daemon=True).start()
+
+
 @contextmanager
 def told_in_log(progress: Progress, every_s: float = LINE_EVERY_S) -> Iterator[None]:
     """Write the tasks of a progress bar that got on to stderr where no terminal shows the bar.

@@ -6,9 +6,10 @@ import json
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -18,7 +19,9 @@ from palpate.errors import ConfigError, DatasetError, SimulationError
 from palpate.rigid import path_lengths
 from palpate_fem.arrays import Floats
 from palpate_fem.calibration.calibrate import calibrate
+from palpate_fem.calibration.local import LocalModel, estimates
 from palpate_fem.calibration.measured import MeasuredIndentation
+from palpate_fem.calibration.point import CalibrationCase, SimulatedPoint
 from palpate_fem.calibration.recover import recover
 from palpate_fem.calibration.result import Evaluation, read_parameters, write_calibration
 from palpate_fem.calibration.runs import PlannedPath, RunSlopes, SimulatedRun
@@ -294,6 +297,29 @@ def test_a_bound_that_is_reached_is_told() -> None:
     assert friction.value == pytest.approx(0.3, rel=1e-3)
 
 
+def test_a_bound_is_not_exceeded_in_the_last_digit() -> None:
+    """exp(log(1e7)) is more than 1e7, which no finger may have."""
+    stiff = cast("FingertipParameters", SimpleNamespace(**asdict(TRUTH) | {MODULUS: 2e7}))
+    bounds = PAPER_BOUNDS | {MODULUS: (1e5, 1e7)}
+    found = calibrate(Formula(), measure(truth=stiff), CalibrationSettings(bounds=bounds))
+    assert found.parameters.shear_modulus_pa == found.value(MODULUS) == 1e7
+
+
+def test_nothing_is_determined_where_all_stopped_at_bounds() -> None:
+    bounds = {THICKNESS: (1.4e-3, 1.9e-3), FRICTION: (0.25, 0.7), VOLUME: (8e-7, 1.2e-6)}
+    settings = CalibrationSettings(bounds=bounds | {MODULUS: (3e5, 6e5)})
+    at = np.array([low for low, _ in bounds.values()])
+    finger, items, names = settings.parameters(at), measure(), settings.simulated
+    runs = [
+        SlopeFormula().simulate_slopes(finger, item.indenter, item.pose, names) for item in items
+    ]
+    cases = [CalibrationCase.of(item, settings) for item in items]
+    model = LocalModel(SimulatedPoint.of(at, runs), (), cases, settings)
+    found = estimates(model, np.zeros(3), math.log(3e5))
+    assert len(found) == 4
+    assert all(item.at_bound and math.isnan(item.sd) for item in found)
+
+
 def test_stated_deviation_grows_with_the_noise() -> None:
     sds = []
     for noise_n in (0.01, 0.03):
@@ -401,6 +427,10 @@ def test_json_of_a_recovery_that_fails_is_json(monkeypatch: pytest.MonkeyPatch) 
     assert done.exit_code == 1
     told = json.loads(done.stdout, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
     assert told["found"][MODULUS] is None
+    oblique = ANGLED.name + "/virtual1"
+    force = next(item.force for item in found.measured if item.name == oblique)
+    largest = np.sqrt((force**2).sum(axis=1)).max()
+    assert told["largest_force_n"][oblique] == pytest.approx(largest)
     assert set(told["deviation"].values()) == {None}
 
 

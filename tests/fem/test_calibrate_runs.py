@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -36,6 +45,8 @@ class Spring:
     ) -> SimulatedRun:
         if indenter == "unknown":
             raise ConfigError("no such indenter", remedy="none")
+        if indenter == "defect":
+            raise ZeroDivisionError("somewhere")
         way = path_lengths(path)
         force = np.outer(way * parameters.shear_modulus_pa, np.array([0.0, 0.0, 1.0]))
         return SimulatedRun(force, way, 0.0151, 8e-7, IndentationOutcome.COMPLETE)
@@ -61,13 +72,43 @@ def test_each_run_is_made_once_whatever_the_sensor() -> None:
     assert runs.count == 4
 
 
-def test_a_refused_run_is_that_runs_trouble_only() -> None:
+@pytest.mark.parametrize(
+    ("indenter", "why", "traceback"),
+    [("unknown", "no such indenter", False), ("defect", "ZeroDivisionError: somewhere", True)],
+)
+def test_a_refused_run_is_that_runs_trouble_only(
+    indenter: str, why: str, traceback: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
     bad, good = SimulationRuns(Spring()).run(
-        [(TRUTH, replace(press(), indenter="unknown")), (TRUTH, press())]
+        [(TRUTH, replace(press(), indenter=indenter)), (TRUTH, press())]
     )
     assert (len(bad.forces), bad.outcome) == (0, IndentationOutcome.DIVERGED)
-    assert "no such indenter" in bad.reason
+    assert why in bad.reason
     assert len(good.forces) == 5
+    assert ("Traceback" in capsys.readouterr().err) is traceback
+
+
+class Stub:
+    """A pressurised finger whose force grows by 1 N from step to step."""
+
+    total_thickness_m, fluid_volume_m3 = 15.1e-3, 8e-7
+    parameters = TRUTH
+
+    def indent(self, indenter: object, path: Floats, history: object) -> IndentationResult:
+        steps = cast("Any", [SimpleNamespace(force=np.array([0, 0, k])) for k in range(1, 5)])
+        return IndentationResult("cube", path, tuple(steps), IndentationOutcome.COMPLETE)
+
+
+def test_a_run_that_cannot_be_derived_keeps_its_forces(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise SimulationError("the linearised equations are not solved", remedy="none")
+
+    monkeypatch.setattr("palpate_fem.calibration.runs._filled", lambda *_: Stub())
+    monkeypatch.setattr("palpate_fem.calibration.runs.sensitivities", fail)
+    (run,) = SimulationRuns(FingertipSimulator()).run([(TRUTH, press())], (FRICTION,))
+    assert (run.outcome, run.reason) == (IndentationOutcome.COMPLETE, "")
+    np.testing.assert_array_equal(run.forces[:, 2], np.arange(5))
+    assert run.slopes is None
 
 
 def test_a_solvers_steps_begin_at_the_second_pose() -> None:
@@ -171,6 +212,61 @@ def test_runs_in_a_process_of_their_own_are_derived_too(pad_press: MeasuredInden
     np.testing.assert_array_equal(run.forces, here.forces)
     assert run.slopes is not None
     assert run.slopes.names == (FRICTION,)
+
+
+BUSY = """
+import multiprocessing, time
+from palpate_fem.cli.identify import slope_simulator_for
+from palpate_fem.cli.model import model_of
+
+if __name__ == "__main__":
+    model = model_of(mesh="biotac", edge_mm=None, layers=2)
+    with slope_simulator_for(model, 2, 2) as (_, executor, _):
+        list(executor.map(time.sleep, [0.5, 0.5]))
+        one = executor.submit(time.sleep, 600)
+        print(*(worker.pid for worker in multiprocessing.active_children()), flush=True)
+        one.result()
+"""
+"""One worker is busy, the other waits for its next run."""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_workers_of_slopes_end_with_their_command(tmp_path: Path, number: signal.Signals) -> None:
+    """Ctrl-C goes to the whole group, and is told once; nothing catches SIGKILL."""
+    script, told = tmp_path / "busy.py", tmp_path / "stderr"
+    script.write_text(BUSY, encoding="utf-8")
+    with told.open("w", encoding="utf-8") as stderr:
+        command = subprocess.Popen(
+            [sys.executable, str(script)],
+            stdout=subprocess.PIPE, stderr=stderr, text=True, start_new_session=True,
+        )  # fmt: skip
+    assert command.stdout is not None
+    workers = [int(word) for word in command.stdout.readline().split()]
+    assert len(workers) == 2
+    try:
+        if number == signal.SIGINT:
+            os.killpg(command.pid, number)
+        else:
+            command.send_signal(number)
+        command.wait(60)
+        deadline = time.monotonic() + 20.0
+        while any(_lives(worker) for worker in workers):
+            assert time.monotonic() < deadline, "a worker lives on"
+            time.sleep(0.05)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(command.pid, signal.SIGKILL)
+        command.wait(60)
+        command.stdout.close()
+    assert "SpawnProcess" not in told.read_text(encoding="utf-8")
+
+
+def _lives(pid: int) -> bool:
+    try:
+        words = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    except FileNotFoundError:
+        return False
+    return words[0] != "Z"
 
 
 def test_slopes_of_another_mesh_are_refused() -> None:

@@ -30,6 +30,7 @@ from palpate_fem.calibration.result import read_parameters
 from palpate_fem.cli import model as cli_model
 from palpate_fem.cli.app import fem_app
 from palpate_fem.cli.run import telling_step
+from palpate_fem.cli.terminal import print_table
 from palpate_fem.config import FingertipParameters
 from palpate_fem.indenter.outline import outline_of
 from palpate_fem.indenter.path import COLUMNS
@@ -351,6 +352,15 @@ def test_what_cannot_be_meant_is_refused(words: tuple[object, ...], said: str) -
 TRUTH = FingertipParameters(
     skin_thickness_m=1.4e-3, shear_modulus_pa=3.2e5, friction_coefficient=0.35
 )
+
+
+def test_units_in_tables_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    """Rich takes [mm] for a style, and leaves it out."""
+    rows = [("moved [um]", "stopped at pose[k]")]
+    print_table(("", "depth offset [mm]"), rows, title="a [s]", caption="b [kPa]")
+    told = capsys.readouterr().out
+    for words in ("moved [um]", "pose[k]", "depth offset [mm]", "a [s]", "b [kPa]"):
+        assert words in told
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from palpate_fem.calibration.measured import (
     read_indentations,
     write_indentations,
 )
+from palpate_fem.indenter.path import check_path
 
 NAME = "sphere_medium/03/normal/biotac1"
 
@@ -70,6 +71,23 @@ def test_numbers_of_less_precision_are_read(path: Path) -> None:
     np.testing.assert_allclose(item.force, press().force, rtol=1e-6)
 
 
+def test_a_name_that_begins_another_is_read_too(tmp_path: Path) -> None:
+    path = tmp_path / "measured.h5"
+    names = ["cube/00", "cube/00/normal", "cube/00/normal/biotac1"]
+    write_indentations(path, [press(name) for name in names], source="a test")
+    assert [item.name for item in read_indentations(path)] == names
+
+
+def test_a_rounded_quaternion_can_be_simulated() -> None:
+    pose = press().pose.copy()
+    pose[:, 3:] = 0.9239, 0.0, 0.3827, 0.0  # 45 degrees, rounded
+    kept = pose.copy()
+    item = replace(press(), pose=pose)
+    check_path(item.pose)
+    np.testing.assert_allclose(item.pose, pose, atol=1e-4)
+    np.testing.assert_array_equal(pose, kept)
+
+
 def _delete(name: str) -> Callable[[Any], None]:
     def change(file: Any) -> None:
         del file[f"trajectories/{NAME}"][name]
@@ -104,6 +122,7 @@ def _drop_sensor(file: Any) -> None:
 
 
 HERE = f"trajectories/{NAME}"
+IN_MILLIMETRES = [(0, 0, z, 1.0, 0, 0, 0) for z in range(5)]
 
 
 @pytest.mark.parametrize(
@@ -126,6 +145,7 @@ HERE = f"trajectories/{NAME}"
         (_replace("force", np.full((5, 3), b"x")), "no numbers"),
         (_replace("pose", np.zeros((5, 7))), "no unit quaternion"),
         (_replace("pose", np.tile([0, 0, 0, 1.0, 0, 0, 0], (5, 1))), "does not move"),
+        (_replace("pose", IN_MILLIMETRES), "row 4 is 4 m away"),
     ],
 )
 def test_what_breaks_the_schema_is_named(

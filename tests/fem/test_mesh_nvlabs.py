@@ -156,6 +156,7 @@ def test_an_open_skin_is_refused(folder: Path, tmp_path: Path) -> None:
     [
         ("", "holds no mesh"),
         ("v 0 0 0 0\nt 0 1 2 3\n", "names vertex 3 of 1"),
+        ("v 0 0 0 0\nt 0 0 0 -2\n", "names vertex -2 of 1"),
         ("v 0 0 zero 0\n", "line 1"),
         ("v 0 0 0 0\nt 0 1 2\n", "line 2"),
         ("v 0 0\nv 0 0 0\nt 0 0 0 0\n", "different lengths"),

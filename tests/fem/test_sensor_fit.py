@@ -372,6 +372,16 @@ def test_a_recording_is_read_or_refused(tmp_path: Path) -> None:
             call()
 
 
+def test_a_recording_of_the_rest_will_do_where_no_touch_is_asked_for(tmp_path: Path) -> None:
+    rest = np.tile(REST, (100, 1))
+    path = write_recording(tmp_path / "rest.h5", rows_of=(REST, rest, np.zeros((100, 3))))
+    with pytest.raises(DatasetError, match="was held"):
+        read_touches(path)
+    touches = read_touches(path, rest_alone=True)
+    assert len(touches) == 0
+    np.testing.assert_array_equal(touches.rest, REST)
+
+
 def test_touches_are_tared_by_the_tare_that_was_in_force(tmp_path: Path) -> None:
     """The same dents, with one electrode near the converter's end, after each of two tares."""
     rest = np.repeat([2700.0, 2500.0], 120)[:, None] * np.ones(SENSING)
@@ -457,3 +467,12 @@ def test_the_command_writes_a_population_that_the_twin_takes(tmp_path: Path) -> 
     assert "mine" in CliRunner().invoke(fem_app, ["units", "show", str(out)]).output
     refused = CliRunner().invoke(fem_app, [*command, "--touches", "-1"])
     assert isinstance(refused.exception, ConfigError)
+    mixed = np.clip(rest - 3.0 * (np.array(counts) - rest)[:, ::-1], 1.0, 4094.0)
+    for rows_of, asked, code, words in (
+        ((rest, mixed, np.array(force)), "3", 1, "do not explain the electrodes"),
+        ((rest, np.tile(rest, (9, 1)), np.zeros((9, 3))), "0", 0, "the rest and 0 of 0 touches"),
+    ):
+        write_recording(recorded, rows_of=rows_of)
+        done = CliRunner().invoke(fem_app, [*command, "--touches", asked], env={"COLUMNS": "100"})
+        assert done.exit_code == code, done.output
+        assert words in done.output

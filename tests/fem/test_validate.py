@@ -304,6 +304,7 @@ def test_a_stored_simulation_of_another_path_is_refused(store: SimulationStore) 
         runs, refused = simulated_from(store, [other])
         assert not runs
         assert why in refused[item.name]
+        assert validate([other], runs, refused).excluded == refused
 
 
 def test_measurements_are_read_from_their_own_schema(tmp_path: Path) -> None:

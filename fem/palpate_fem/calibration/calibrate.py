@@ -213,7 +213,9 @@ class _Search:
             if (np.abs(shift) <= smallest).all() or gain <= _ENOUGH * fit.cost:
                 converged = True
                 break
-            trial = self.simulate([state.point * np.exp(shift)])[0]
+            logs = np.log(state.point) + shift
+            point = [self.settings.bounded(*pair) for pair in zip(names, logs, strict=True)]
+            trial = self.simulate([np.array(point)])[0]
             trial_fit = self.evaluate(trial, "step")
             won = fit.cost - trial_fit.cost
             # A trust region: accept a step that wins a tenth of what the model promised, and let

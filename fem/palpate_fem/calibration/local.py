@@ -312,7 +312,7 @@ def estimates(
     variance[free] = _variance(model, slopes, residuals, free, log_modulus, shift)
     result = []
     for i, name in enumerate(names):
-        value = math.exp(logs[i])
+        value = settings.bounded(name, logs[i])
         sensitivity = 0.01 * float(np.sqrt((slopes[:, :, i] ** 2).mean(axis=0)).sum())
         low, high = settings.bounds[name]
         sd = value * float(np.sqrt(variance[i]))
@@ -335,7 +335,7 @@ def _variance(
     # A free volume is tied to the target thickness, so only directions along it remain.
     basis = np.eye(len(free))
     along = np.append(model.thickness_slopes, 0.0)[free]
-    if model.settings.volume_is_free and np.abs(along).max() > 0.0:
+    if model.settings.volume_is_free and np.abs(along).max(initial=0.0) > 0.0:
         basis = null_space(along[None])
     bend, directions = np.linalg.eigh(basis.T @ hessian @ basis)
     seen = bend > _BLIND * max(float(bend.max(initial=0.0)), 1e-300)

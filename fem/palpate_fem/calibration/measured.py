@@ -33,6 +33,7 @@ from palpate.files.hdf5 import (
 )
 from palpate.files.simulation_store import check_id
 from palpate_fem.arrays import Floats
+from palpate_fem.indenter.path import REACH_M
 
 INDENTATIONS = Hdf5Schema(
     "palpate.indentations",
@@ -56,13 +57,15 @@ class MeasuredIndentation:
         name: Unique in its file; words between slashes, as the ids of a simulation store.
         indenter: Name of the indenter.
         sensor: Which BioTac, e.g. ``biotac1``.
-        pose: Indenter in the sensor frame, position [m] and quaternion w x y z, shape (K, 7).
+        pose: Indenter in the sensor frame, position [m] and quaternion w x y z, shape (K, 7); the
+            quaternions are brought to length 1.
         force: Net force on the BioTac [N], sensor frame, shape (K, 3).
         origin: ``measured`` or ``simulated``.
         outcome: How it ended, if simulated (the words of ``result.IndentationOutcome``).
 
     Raises:
-        DatasetError: Shapes, NaN, no unit quaternion, no movement; names the trajectory.
+        DatasetError: Shapes, NaN, no unit quaternion, positions that are not in metres, no
+            movement; names the trajectory.
     """
 
     name: str
@@ -80,6 +83,9 @@ class MeasuredIndentation:
                 f"trajectory {self.name!r}: {problem}",
                 remedy="correct it, or leave this trajectory out",
             )
+        lengths = np.linalg.norm(self.pose[:, 3:], axis=1, keepdims=True)
+        pose = np.hstack([self.pose[:, :3], self.pose[:, 3:] / lengths])
+        object.__setattr__(self, "pose", pose)
 
     def _problem(self) -> str:
         try:
@@ -104,6 +110,11 @@ class MeasuredIndentation:
         lengths = np.linalg.norm(self.pose[:, 3:], axis=1)
         if np.abs(lengths - 1.0).max() > _UNIT_QUATERNION:
             return f"orientation is no unit quaternion in row {np.abs(lengths - 1.0).argmax()}"
+        far = np.abs(self.pose[:, :3]).max(axis=1)
+        if far.max() > REACH_M:
+            return (
+                f"row {far.argmax()} is {far.max():.3g} m away from the sensor, not in {REACH_M} m"
+            )
         if not np.ptp(self.pose[:, :3], axis=0).any():
             return "the indenter does not move"
         return ""
@@ -192,13 +203,16 @@ def _origin(path: Path, file: Any) -> str:
 
 
 def _trajectories(group: Any, kind: type, above: str = "") -> dict[str, Any]:
-    """Groups without further groups in them, by id: an id may have slashes."""
+    """Groups with arrays, or with nothing in them, by id: an id may have slashes."""
     found: dict[str, Any] = {}
     for name, child in group.items():
         if not isinstance(child, kind):
             continue
         inner = _trajectories(child, kind, f"{above}{name}/")
-        found |= inner or {above + name: child}
+        has_arrays = any(array in child and not isinstance(child[array], kind) for array in COLUMNS)
+        if has_arrays or not inner:
+            found[above + name] = child
+        found |= inner
     return found
 
 

@@ -166,12 +166,13 @@ def fit_modulus(
         options={"xatol": 1e-4},
     )
     log, lowest = (found.x, found.fun) if found.fun < costs[best] else (grid[best], costs[best])
-    factor = math.exp(log) / settings.reference_shear_modulus_pa
+    modulus_pa = settings.bounded(MODULUS, log)
+    factor = modulus_pa / settings.reference_shear_modulus_pa
     pairs = tuple(
         compare(line, case, factor, settings)
         for line, case in zip(state.curves, cases, strict=True)
     )
-    return ModulusFit(float(lowest), math.exp(log), pairs, {})
+    return ModulusFit(float(lowest), modulus_pa, pairs, {})
 
 
 def failures_at(

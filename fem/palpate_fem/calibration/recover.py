@@ -132,7 +132,8 @@ def recover(
 ) -> ParameterRecovery:
     """Calibrate on simulated, noisy trajectories of known parameters.
 
-    The calibration gets forces and poses only, and begins with its scan.
+    The calibration gets forces and poses only, and begins with its scan, or, by a `SlopeSimulator`,
+    in the middle of the bounds.
 
     Args:
         simulator: Runs the known and the calibrated simulations.

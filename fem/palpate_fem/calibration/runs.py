@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError, Executor, Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -12,7 +13,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from palpate.errors import ConfigError, SimulationError
+from palpate.errors import ConfigError, PalpateError, SimulationError
 from palpate.rigid import path_lengths
 from palpate_fem.arrays import Floats
 from palpate_fem.calibration.alignment import ForceCurve, along
@@ -142,7 +143,7 @@ class SlopeSimulator(Simulator, Protocol):
         path: Floats,
         names: tuple[str, ...],
     ) -> SimulatedRun:
-        """As `simulate`, with derivatives by these parameters."""
+        """As `simulate`, with derivatives by these parameters if there are any."""
         ...
 
 
@@ -176,6 +177,8 @@ class FingertipSimulator:
     ) -> SimulatedRun:
         """See `SlopeSimulator.simulate_slopes`.
 
+        A run that cannot be derived is returned without derivatives.
+
         Raises:
             SimulationError: The finger cannot be filled, or the indenter begins inside of it.
         """
@@ -189,7 +192,10 @@ class FingertipSimulator:
         )
         if not names or not result.steps:
             return run
-        found = sensitivities(tip, history, names)
+        try:
+            found = sensitivities(tip, history, names)
+        except SimulationError:
+            return run
         slopes = RunSlopes(
             names,
             np.concatenate([np.zeros((1, 3, len(names))), found.force]),
@@ -240,7 +246,7 @@ class SimulationRuns:
         """Results in the order of the jobs; what ran before is not run again.
 
         With names of parameters in ``slopes`` a `SlopeSimulator` derives by them. A run that the
-        simulator refuses gives a result without steps, with the reason.
+        simulator refuses, or that a defect ends, gives a result without steps, with the reason.
 
         Raises:
             SimulationError: A process of the simulation died.
@@ -289,21 +295,23 @@ def _simulate(
     path: Floats,
     slopes: tuple[str, ...],
 ) -> SimulatedRun:
-    """One run; if it is refused, only this trajectory has no result."""
+    """One run; if it is refused or fails, only this trajectory has no result."""
     try:
         if slopes and isinstance(simulator, SlopeSimulator):
             return simulator.simulate_slopes(parameters, indenter, path, slopes)
         return simulator.simulate(parameters, indenter, path)
     except (SimulationError, ConfigError) as error:
-        nothing = np.empty(0)
-        return SimulatedRun(
-            np.empty((0, 3)),
-            nothing,
-            math.nan,
-            math.nan,
-            IndentationOutcome.DIVERGED,
-            f"refused: {error}",
-        )
+        return _without_steps(f"refused: {error}")
+    except PalpateError:  # of all runs, e.g. no process can start
+        raise
+    except Exception as error:  # a defect, which costs this run only, as in the worker of a service
+        sys.excepthook(type(error), error, error.__traceback__)
+        return _without_steps(f"failed: {type(error).__name__}: {error}")
+
+
+def _without_steps(reason: str) -> SimulatedRun:
+    none = np.empty((0, 3))
+    return SimulatedRun(none, none[:, 0], math.nan, math.nan, IndentationOutcome.DIVERGED, reason)
 
 
 def _key(

@@ -110,6 +110,11 @@ class CalibrationSettings:
         low, high = self.bounds[name]
         return math.log(low), math.log(high)
 
+    def bounded(self, name: str, log_value: float) -> float:
+        """A parameter by its logarithm, within its bounds also in the last digit."""
+        low, high = self.bounds[name]
+        return min(max(math.exp(log_value), low), high)
+
     def parameters(self, point: Floats, modulus_pa: float | None = None) -> FingertipParameters:
         """The finger at a point.
 

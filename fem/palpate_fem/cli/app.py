@@ -610,7 +610,11 @@ def fit(
     _refuse_given(context, {"overtravel_mm"}, "with --recording")
     from palpate_fem.cli.identify import fit_sensor_command
 
-    fit_sensor_command(store, out, recording, sensor=sensor, touches=touches, held_rows=held_rows)
+    raise typer.Exit(
+        fit_sensor_command(
+            store, out, recording, sensor=sensor, touches=touches, held_rows=held_rows
+        )
+    )
 
 
 @units_app.command(epilog="Example: palpate fem units draw 20 --seed 1 --out drawn.json")

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from palpate.config import looking_at
 from palpate.errors import ConfigError
 from palpate.files.outputs import check_output
 from palpate_fem.calibration.result import without_nan
@@ -34,11 +35,14 @@ def verify_command(*, only: str | None, slow: bool, shared_data: Path | None, as
     from palpate_fem.verify import PUBLIC_SKIN, run
 
     # Whoever names the folder wants the check that needs it, so it must not be skipped silently.
-    if shared_data is not None and not (shared_data / PUBLIC_SKIN).is_dir():
-        raise ConfigError(
-            f"--public-data {shared_data}: there is no {PUBLIC_SKIN} in it",
-            remedy=f"give the folder that holds {PUBLIC_SKIN}, or leave it out",
-        )
+    if shared_data is not None:
+        with looking_at(shared_data):
+            is_there = (shared_data / PUBLIC_SKIN).is_dir()
+        if not is_there:
+            raise ConfigError(
+                f"--public-data {shared_data}: there is no {PUBLIC_SKIN} in it",
+                remedy=f"give the folder that holds {PUBLIC_SKIN}, or leave it out",
+            )
     checks: list[VerificationCheck] = []
     with progress_bar() as bar:
         task = bar.add_task("verify", total=None)

@@ -10,20 +10,21 @@ from __future__ import annotations
 import json
 import math
 import re
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 
 import numpy as np
 import typer
-from rich.markup import escape
 from rich.progress import Progress
 
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.outputs import check_folder, check_output
+from palpate.process import end_with_parent
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, recover
@@ -126,8 +127,7 @@ def validate_command(
             simulated = simulate_all(
                 simulator, model.parameters, chosen, executor=executor, on_run=bar.on_run
             )
-    result = validate(chosen, simulated)
-    print_lines(*(f"{name}: {why}" for name, why in refused.items()))
+    result = validate(chosen, simulated, refused)
     if result.compared:
         print_table(INDENTER_HEADINGS, indenter_rows(result))
     print_lines(*summary_lines(result))
@@ -193,11 +193,25 @@ def slope_simulator_for(
     if "mesh" in options:
         raise ConfigError("--slopes is for the parametric mesh", remedy="leave out --mesh")
     count, _ = workers_for(workers, jobs)
+    others = set(active_children())
     with (
-        ProcessPoolExecutor(count, mp_context=get_context("spawn")) as executor,
+        ProcessPoolExecutor(
+            count, mp_context=get_context("spawn"), initializer=_begin_worker
+        ) as executor,
         progress_bar() as bar,
     ):
-        yield FingertipSimulator(**options), executor, _SearchBar(bar)  # type: ignore[arg-type]
+        try:
+            yield FingertipSimulator(**options), executor, _SearchBar(bar)  # type: ignore[arg-type]
+        except BaseException:  # the executor would wait for runs that nobody needs
+            for worker in set(active_children()) - others:
+                worker.kill()
+            raise
+
+
+def _begin_worker() -> None:
+    # Ctrl-C is for the command, which ends its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
 
 
 class _SearchBar:
@@ -293,7 +307,9 @@ def _recovery_json(recovery: ParameterRecovery, noise_n: float, seed: int) -> di
         "planted": recovery.truth,
         "found": recovery.found,
         "error": recovery.errors,
-        "largest_force_n": {item.name: float(abs(item.force).max()) for item in recovery.measured},
+        "largest_force_n": {
+            item.name: float(np.linalg.norm(item.force, axis=1).max()) for item in recovery.measured
+        },
     }
 
 
@@ -389,12 +405,16 @@ def fit_units_command(store: Path, out: Path, *, overtravel_m: float | None) -> 
 
 def fit_sensor_command(
     store: Path, out: Path, recording: Path, *, sensor: str, touches: int | None, held_rows: int
-) -> None:
-    """Fit one specimen to a recorded sensor on a store of presses, and write it."""
+) -> int:
+    """Fit one specimen to a recorded sensor on a store of presses, and write it.
+
+    Returns:
+        1 if the presses do not explain the electrodes.
+    """
     check_output(out, "--out", ".json", store, recording)
     if touches is not None and touches < 0:
         raise ConfigError(f"{touches} touches", remedy="give 0 for the rest alone, or more")
-    found = read_touches(recording, sensor=sensor, rows=held_rows)
+    found = read_touches(recording, sensor=sensor, rows=held_rows, rest_alone=touches == 0)
     some = found.some(slice(0, len(found) if touches is None else touches))
     opened = SimulationStore.open(store)
     model = ElectrodeModel(geometry_of(opened.fingertip()))
@@ -415,7 +435,7 @@ def fit_sensor_command(
     write_population(out, [member], source=source)
     print_table(
         ("", found.name),
-        [(escape(label), f"{of(fit.specimen):.3g}") for label, of in ELECTRICAL],
+        [(label, f"{of(fit.specimen):.3g}") for label, of in ELECTRICAL],
         title=f"fitted to the rest and {len(some)} of {len(found)} touches",
         numbers_from=1,
     )
@@ -432,6 +452,7 @@ def fit_sensor_command(
             "check that they are E1..E19 in order, raw and live"
         )
     print_lines(*lines, f"wrote {out}")
+    return 1 if fit.tells_nothing else 0
 
 
 def show_units_command(file: Path | None, *, as_json: bool) -> None:
@@ -479,7 +500,7 @@ def draw_units_command(count: int, seed: int, out: Path | None, *, as_json: bool
         ("", "5 %", "median", "95 %"),
         [
             (
-                escape(label),
+                label,
                 *(
                     f"{value:.3g}"
                     for value in np.percentile(
@@ -509,8 +530,7 @@ def _show_members(members: Sequence[Member]) -> None:
     ]
     print_table(
         ("", *(member.specimen.name for member in members)),
-        # Rich would take [N] for a style.
-        [(escape(label), *(value(member) for member in members)) for label, value in rows],
+        [(label, *(value(member) for member in members)) for label, value in rows],
         title="specimens: found (published)",
         numbers_from=1,
     )

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from palpate.config import looking_at
 from palpate.errors import ConfigError
 from palpate_fem.config import FingertipParameters
 from palpate_fem.mesh.solid import check_limits
@@ -90,13 +91,15 @@ def model_of(
     """Check the options and convert their units.
 
     Raises:
-        ConfigError: A value is out of range, or a file does not exist.
+        ConfigError: A value is out of range, or a file does not exist or is closed.
     """
     # Here, for a worker would report it as a failure of its own.
     check_limits(layers=layers, **({} if edge_mm is None else {"edge_m": edge_mm * 1e-3}))
     options: dict[str, object] = {"layers": layers}
     if mesh != PARAMETRIC:
-        if not Path(mesh).is_dir():
+        with looking_at(Path(mesh)):
+            is_folder = Path(mesh).is_dir()
+        if not is_folder:
             raise ConfigError(
                 f"--mesh {mesh}: there is no such folder",
                 remedy=f"give the folder that holds meshes/biotac, or {PARAMETRIC!r}",

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -60,21 +61,21 @@ def print_table(
     caption: str = "",
     numbers_from: int | None = None,
 ) -> None:
-    """Print a table to stdout.
+    """Print a table to stdout, its texts unchanged: Rich would take [mm] for a style.
 
     Args:
         headings: Of the columns.
-        rows: Cells, as Rich markup.
+        rows: Cells.
         title: Above it.
         caption: Below it.
         numbers_from: First of the columns that hold numbers, which are aligned right; None = none.
     """
-    table = Table(title=title or None, caption=caption or None)
+    table = Table(title=escape(title) or None, caption=escape(caption) or None)
     for at, heading in enumerate(headings):
         right = numbers_from is not None and at >= numbers_from
-        table.add_column(heading, justify="right" if right else "left", overflow="fold")
+        table.add_column(escape(heading), justify="right" if right else "left", overflow="fold")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     Console().print(table)
 
 

@@ -77,8 +77,9 @@ def _read(path: Path, *, element: str, nodes: int, first: int) -> tuple[Floats, 
     if points.ndim != 2 or points.shape[1] != 3 or not ids.size:
         raise ConfigError(f"{path} holds no mesh: no complete 'v' or '{element}'", remedy=REMEDY)
     if ids.min() < 0 or ids.max() >= len(points):
+        wrong = ids.min() if ids.min() < 0 else ids.max()
         raise ConfigError(
-            f"{path} names vertex {int(ids.max()) + first} of {len(points)}", remedy=REMEDY
+            f"{path} names vertex {int(wrong) + first} of {len(points)}", remedy=REMEDY
         )
     if not np.isfinite(points).all():
         raise ConfigError(f"{path} holds a vertex that is not finite", remedy=REMEDY)

@@ -154,6 +154,7 @@ def touches_of(
     group: NDArray[np.integer[Any]] | None = None,
     rows: int = HELD_ROWS,
     still: float = STILL_COUNTS,
+    rest_alone: bool = False,
 ) -> SensorTouches:
     """Touches that were held, each the mean of its stretch.
 
@@ -167,6 +168,7 @@ def touches_of(
             are of one.
         rows: Shortest stretch.
         still: See `STILL_COUNTS`.
+        rest_alone: Whether no touch at all will do.
 
     Raises:
         DatasetError: As `SensorTouches`; or nothing was held.
@@ -192,14 +194,15 @@ def touches_of(
         for one in held(tared[start:end], rows=rows, still=still)
     ]
     kept = [one for one in stretches if np.linalg.norm(force[one].mean(axis=0)) >= LEAST_N]
-    if not kept:
+    if not kept and not rest_alone:
         raise DatasetError(
             f"{name}: no touch of {LEAST_N} N was held for {rows} rows",
             remedy="hold each touch for half a second, or ask for fewer rows",
         )
 
     def means(values: Floats) -> Floats:
-        return np.array([values[one].mean(axis=0) for one in kept], np.float64)
+        found = [values[one].mean(axis=0) for one in kept]
+        return np.array(found, np.float64).reshape(len(kept), values.shape[1])
 
     return SensorTouches(
         name,
@@ -210,7 +213,9 @@ def touches_of(
     )
 
 
-def read_touches(path: Path, *, sensor: str = "", rows: int = HELD_ROWS) -> SensorTouches:
+def read_touches(
+    path: Path, *, sensor: str = "", rows: int = HELD_ROWS, rest_alone: bool = False
+) -> SensorTouches:
     """Touches of one sensor of a data set (schema ``palpate.features``).
 
     Args:
@@ -218,6 +223,7 @@ def read_touches(path: Path, *, sensor: str = "", rows: int = HELD_ROWS) -> Sens
             forces, and which rows are of one recording or press. The rest is that of the first row.
         sensor: Its name; empty = the only one.
         rows: Shortest stretch that counts as held.
+        rest_alone: Whether no touch at all will do.
 
     Raises:
         DatasetError: Not such a file; a column is missing; the rows were changed; the sensor is
@@ -251,4 +257,5 @@ def read_touches(path: Path, *, sensor: str = "", rows: int = HELD_ROWS) -> Sens
         baseline=baseline,
         group=None if group is None else group[mine],
         rows=rows,
+        rest_alone=rest_alone,
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from palpate.config import looking_at
 from palpate.errors import DatasetError
 from palpate.files.simulation_store import SIMULATIONS
 from palpate.rigid import path_lengths
@@ -39,9 +40,12 @@ def measured_from(path: Path) -> tuple[tuple[MeasuredIndentation, ...], dict[str
         The trajectories, and the reason by name for those that cannot be used.
 
     Raises:
+        ConfigError: It is closed, or lies in a folder that is.
         DatasetError: It is neither of them, or damaged.
     """
-    if path.is_file() and not is_file_of(path, SIMULATIONS.name):
+    with looking_at(path):
+        is_file = path.is_file()
+    if is_file and not is_file_of(path, SIMULATIONS.name):
         return read_indentations(path), {}
     store, found, left_out = SimulationStore.open(path), [], {}
     for name in store.ids():

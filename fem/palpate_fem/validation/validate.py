@@ -154,6 +154,7 @@ class Validation:
 def validate(
     measured: Sequence[MeasuredIndentation],
     simulated: Mapping[str, SimulatedRun],
+    refused: Mapping[str, str] | None = None,
     *,
     threshold_n: float = THRESHOLD_N,
     increments: int = INCREMENTS,
@@ -163,6 +164,7 @@ def validate(
     Args:
         measured: Measured trajectories; if they are simulations, this is a self-test.
         simulated: By the name of the measured trajectory, along the same path.
+        refused: Why a simulation cannot be used, by the name of the measured trajectory.
         threshold_n: Force at which curves are aligned [N].
         increments: Samples of a curve.
     """
@@ -170,7 +172,7 @@ def validate(
     for item in measured:
         run = simulated.get(item.name)
         if run is None:
-            excluded[item.name] = "not simulated"
+            excluded[item.name] = (refused or {}).get(item.name, "not simulated")
             continue
         try:
             compared.append(_compare(item, run, threshold_n, increments))

@@ -155,9 +155,9 @@ def _squeeze() -> dict[float, float]:
     f"{1e3 * depth:g}": depth for depth in SQUEEZE_N
 })  # fmt: skip
 def squeeze(depth: float) -> Measurement:
-    """Ball of R 3.5 mm pressed 51 to 70 % deep into a layer as thick as the skin, base held.
+    """Ball of R 3.5 mm pressed 51 to 70 % deep into a layer as thick as the skin.
 
-    Contact at the nodes is 5 to 7 % too soft here.
+    The layer slides on its base. Contact at the nodes is 5 to 7 % too soft here.
     """
     return Measurement(_squeeze()[depth], SQUEEZE_N[depth])
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from palpate.config import looking_at
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate.process import require
@@ -105,13 +106,16 @@ def opened(
     """An HDF5 file to read from; ``missing`` says what to do if there is no such file.
 
     Raises:
+        ConfigError: It lies in a folder that is closed.
         DatasetError: It is missing, truncated or damaged.
         MissingExtraError: h5py is not installed; ``extra`` of palpate installs it.
     """
     h5 = h5py_module(extra)
-    if path.is_dir():
+    with looking_at(path):
+        is_folder, is_file = path.is_dir(), path.is_file()
+    if is_folder:
         raise DatasetError(f"{path} is a folder", remedy=name_a_file(path))
-    if not path.is_file():
+    if not is_file:
         raise DatasetError(f"{path}: no such file", remedy=missing)
     try:
         # Our files appear whole and never change, so no lock is needed, which some disks lack.

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from palpate.config import looking_at
 from palpate.errors import ConfigError, DatasetError, PalpateError
 from palpate.files.hdf5 import Hdf5Schema, h5py_module, text
 
@@ -67,14 +68,17 @@ class SimulationFiles:
         """Open a store: a folder ``NAME.sim``, or a file in the same schema.
 
         Raises:
+            ConfigError: It is closed, or lies in a folder that is.
             DatasetError: It does not exist, is damaged, or has another schema or version.
             MissingExtraError: h5py is not installed.
         """
         path = Path(path)
-        store = cls(path)
-        if not path.exists():
+        with looking_at(path):
+            store = cls(path)
+            exists, begun = path.exists(), store._whole or (path / FINGERTIP).is_file()
+        if not exists:
             raise DatasetError(f"{path}: no such store", remedy="check the path")
-        if not store._whole and not (path / FINGERTIP).is_file():
+        if not begun:
             raise DatasetError(
                 f"{path}: no {FINGERTIP} in it: no store, or one whose writer did not get that far",
                 remedy="name another folder, or run the command that writes it again",

@@ -36,8 +36,8 @@ from palpate.cluster import WorkerLostError
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate.files.hdf5 import add_array
+from palpate.process import end_with_parent
 from palpate_training.datasets.container import read_archive
-from palpate_training.experiment.generate.workers import end_with_parent
 from palpate_training.learning.splits import Fold, RowSplit
 
 _log = logging.getLogger(__name__)

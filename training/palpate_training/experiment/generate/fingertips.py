@@ -24,6 +24,7 @@ from typing import Any, Generic, TypeVar
 
 from palpate.cluster import WorkerLostError
 from palpate.errors import ConfigError, PalpateError
+from palpate.process import end_with_parent
 from palpate_training.experiment.generate.pipeline import (
     MECHANICS,
     SPEC,
@@ -37,7 +38,7 @@ from palpate_training.experiment.generate.simulator import (
     Specimen,
     TwinSimulator,
 )
-from palpate_training.experiment.generate.workers import end_with_parent, limit_threads
+from palpate_training.experiment.generate.workers import limit_threads
 
 _SEEDS = 1000  # of one experiment on several fingertips; presses are a function of the seed
 

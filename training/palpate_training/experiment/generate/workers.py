@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import importlib
-import os
 import signal
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from typing import Protocol, TypeVar
 
 from palpate.cluster import AHEAD, WorkerLostError
-from palpate.process import require
+from palpate.process import end_with_parent, require
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
@@ -50,18 +48,6 @@ def limit_threads(count: int) -> None:
     """Let products of matrices in this process use so many threads at most."""
     importlib.import_module("scipy.linalg")  # brings a linear algebra of its own, as NumPy does
     require("threadpoolctl", extra="training").threadpool_limits(count)
-
-
-def end_with_parent() -> None:
-    """Let a worker not outlive a command that was killed: the pool would wait for ever."""
-    parent = parent_process()
-    assert parent is not None
-
-    def wait_for_end() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait_for_end, name="parent", daemon=True).start()
 
 
 class WorkerProcesses:
