@@ -143,13 +143,14 @@ def _table(comparison: TouchComparison, fields: FieldMedians, left_s: float) -> 
             median = f"{errors[axis] * scale:.{3 if scale == 1.0 else 2}f}"
             table.add_row(escape(what.format(name)), *cells, median, end_section=axis == 2)
     table.add_row(
-        "skin, mean of all nodes [mm]",
+        escape("skin, mean of all nodes [mm]"),
         f"{fields.moved_m * 1e3:.3f}",
         "",
         "",
         f"{fields.field_m * 1e3:.3f}",
     )
-    table.add_row("electrodes from the field [counts]", "", "", "", f"{fields.counts:.0f}")
+    counts = f"{fields.counts:.0f}"
+    table.add_row(escape("electrodes from the field [counts]"), "", "", "", counts)
     if moment.bound is not None and medians.held_share is not None:
         off_n = float(((moment.force - moment.true_force) ** 2).sum() ** 0.5)
         table.add_row(

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
@@ -431,7 +432,7 @@ def _show(report: FingerReport, label: str, console: Console) -> None:
     count = report.presses
     table.add_column(f"{count} presses recorded, each held out" if count else "on other fingers")
     table.add_column("magnitude [N]", justify="right")
-    table.add_column("angle [rad]", justify="right")
+    table.add_column(escape("angle [rad]"), justify="right")
     for words, prefix in (
         ("this bundle", ""),
         ("a line", "linear_"),
