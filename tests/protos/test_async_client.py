@@ -119,6 +119,27 @@ def test_an_async_stream_says_that_it_is_silent_and_goes_on(
     asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
 
 
+def test_an_async_stream_delivers_nothing_that_grew_old_while_its_task_was_busy(
+    link: LinkConfig, finger: Finger
+) -> None:
+    async def scene() -> None:
+        async with (
+            AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot,
+            robot.stream_features("finger", max_age_s=0.2) as stream,
+        ):
+            await anext(stream)
+            while not stream.counters["skipped"]:  # one waits for the task
+                await asyncio.sleep(0.01)
+            finger.silent = True
+            await asyncio.sleep(0.5)  # and is too old now
+            before = finger.sequence
+            finger.silent = False
+            assert (await anext(stream)).source.sequence > before
+            assert stream.counters["stale"] > 0
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
 def test_an_async_stream_tells_of_another_sensor_though_its_task_is_slow(
     link: LinkConfig, finger: Finger
 ) -> None:
