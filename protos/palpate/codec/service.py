@@ -11,6 +11,7 @@ from palpate.codec.base import (
     Codec,
     check_digest,
     check_electrodes,
+    check_request_id,
     check_serial,
     codec_of,
     field_from_wire,
@@ -142,17 +143,13 @@ def _zero_encode(zero: WrenchZero) -> bytes:
     return msg.SerializeToString()
 
 
-def _check_request_id(request_id: str) -> str:
-    return check_serial(request_id, "request_id") if request_id else ""
-
-
 WRENCH_ZERO = codec_of(service_pb2.WrenchZero, _zero_encode, _zero_from_wire)
 WRENCH_ZERO_REQUEST: Codec[WrenchZeroRequest] = codec_of(
     service_pb2.WrenchZeroRequest,
     lambda r: service_pb2.WrenchZeroRequest(
-        readings=r.readings, request_id=_check_request_id(r.request_id)
+        readings=r.readings, request_id=check_request_id(r.request_id)
     ).SerializeToString(),
-    lambda msg: WrenchZeroRequest(msg.readings, _check_request_id(msg.request_id)),
+    lambda msg: WrenchZeroRequest(msg.readings, check_request_id(msg.request_id)),
 )
 
 
@@ -380,10 +377,10 @@ TARE_REQUEST: Codec[TareRequest] = codec_of(
     lambda r: service_pb2.TareRequest(
         tare_id=r.tare_id,
         frames=r.frames,
-        request_id=_check_request_id(r.request_id),
+        request_id=check_request_id(r.request_id),
         anyway=r.anyway,
     ).SerializeToString(),
-    lambda msg: TareRequest(msg.tare_id, msg.frames, _check_request_id(msg.request_id), msg.anyway),
+    lambda msg: TareRequest(msg.tare_id, msg.frames, check_request_id(msg.request_id), msg.anyway),
 )
 SERVICE_REQUEST: Codec[ServiceRequest] = codec_of(
     service_pb2.ServiceRequest, lambda _: b"", lambda _: ServiceRequest()
