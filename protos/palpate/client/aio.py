@@ -220,6 +220,10 @@ class AsyncClient:
             async for estimate in robot.stream_features("finger"):
                 print(estimate.force)
 
+    A stream stays open, with a thread that takes each message, until it or the client is closed:
+    before a ``break`` write ``async with robot.stream_features("finger") as estimates:`` around the
+    loop.
+
     Arguments are those of ``Client``; the bus is joined by ``async with``, and may be again after
     it was left or could not be joined. Functions that a method
     takes (``on_step``, ``on_progress``, ``on_timings``) are called in the event loop.

@@ -96,8 +96,17 @@ def _close_all() -> None:
         client.close()
 
 
+def _leave(session: Session) -> None:
+    """Leave the bus for a client that nobody holds any more, in whatever thread that is noticed."""
+    if not is_inherited():
+        threading.Thread(target=session.close, name="leaving").start()
+
+
 class Client(Closing):
     """A robot's view of a station. Open one and keep it: joining and leaving take time.
+
+    One that is neither closed nor held leaves the bus in the background. What it has made and is in
+    use, a stream or a publisher of poses, holds it.
 
     Methods take the name of a ``sensor``, and as ``timeout_s`` how long an answer may take [s];
     None = the client's timeout.
@@ -135,11 +144,13 @@ class Client(Closing):
             joining_link(connect, wait_s=timeout_s, tls=tls), station=check_name(name, "station")
         )
         self._closed = False
+        self._dropped = weakref.finalize(self, _leave, self._session)
+        self._dropped.atexit = False  # then it is closed
         _open.add(self)
 
     @property
     def session(self) -> Session:
-        """What the client is connected by."""
+        """What the client is connected by; it is closed with it."""
         if self._closed:
             raise LinkError("the client is closed", remedy="open a new Client")
         return self._session
@@ -179,7 +190,9 @@ class Client(Closing):
         """Contact locations and forces of one finger as they come.
 
         ``for estimate in robot.stream_features("finger")`` iterates,
-        ``robot.stream_features("finger").call(function)`` calls back. The newest wins: a slow
+        ``robot.stream_features("finger").call(function)`` calls back. A loop that is left before
+        its end leaves the stream open, until it or the client is closed: write
+        ``with robot.stream_features("finger") as estimates:`` around it. The newest wins: a slow
         consumer finds the last ``depth`` messages, none older than ``max_age_s``. A silence of
         ``timeout_s`` is an error; None = wait for ever. See ``Stream``.
         """
@@ -386,7 +399,7 @@ class Client(Closing):
         A gateway with the driver ``pose_zenoh``, whose option ``robot`` has the same name, turns
         them into poses of the indenter.
         """
-        publisher = RobotPosePublisher(self.session, check_name(robot, "robot"))
+        publisher = RobotPosePublisher(self.session, check_name(robot, "robot"), client=self)
         with self._lock:
             self._publishers = [one for one in self._publishers if not one.closed]
             self._publishers.append(publisher)
@@ -494,6 +507,7 @@ class Client(Closing):
         In a forked process nothing happens: the client is its parent's.
         """
         _open.discard(self)
+        self._dropped.detach()
         if is_inherited():
             return
         self._closed = True
