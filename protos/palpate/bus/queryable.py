@@ -57,8 +57,6 @@ def error_reply(error: BaseException) -> ErrorReply:
 
 
 def _short(text: str) -> str:
-    # Lone surrogates, e.g. of a file name that is no UTF-8, cannot be sent.
-    text = text.encode("utf-8", "backslashreplace").decode()
     left_out = len(text) - _TEXT_MOST
     return text if left_out <= 0 else f"{text[:_TEXT_MOST]} ... ({left_out} characters more)"
 
