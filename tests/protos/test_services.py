@@ -258,6 +258,26 @@ def test_a_robot_needs_five_lines(
         server.join()
 
 
+@pytest.mark.parametrize("name", ["estimate_features", "estimate_field"])
+def test_the_first_frame_is_waited_for_within_the_time_of_the_question(
+    link: LinkConfig, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    waits: list[float] = []
+    wait = Subscriber.next
+
+    def noted(self: Subscriber[Any], timeout_s: float) -> Any:
+        waits.append(timeout_s)
+        return wait(self, timeout_s)
+
+    monkeypatch.setattr(Subscriber, "next", noted)
+    with Client(link.connect[0], timeout_s=2.0) as robot:
+        with pytest.raises(StaleError, match="has arrived yet"):
+            getattr(robot, name)("elbow", timeout_s=0.1)
+        assert 0.0 < max(waits) <= 0.1, "not the client's"
+        with pytest.raises(ConfigError, match="timeout_s"):
+            getattr(robot, name)("elbow", timeout_s=-1.0)
+
+
 def test_only_the_first_call_of_a_sensor_waits(
     link: LinkConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

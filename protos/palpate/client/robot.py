@@ -79,11 +79,16 @@ from palpate.process import Closing
 
 M = TypeVar("M")
 
+FRAME_AGE_S = 0.05
+"""Age of the oldest reading that is "now" by default [s]."""
+
 STREAM_AGE_S = 0.2
 """Age of the oldest reading that a stream delivers by default [s]."""
 
 STREAM_TIMEOUT_S = 10.0
 """Longest silence of a stream by default [s]: a restarted service is back earlier."""
+
+_LEAST_S = 1e-3
 
 
 _open: weakref.WeakSet[Client] = weakref.WeakSet()
@@ -155,7 +160,7 @@ class Client(Closing):
             raise LinkError("the client is closed", remedy="open a new Client")
         return self._session
 
-    def features(self, sensor: str, *, max_age_s: float = 0.05) -> FeatureEstimate:
+    def features(self, sensor: str, *, max_age_s: float = FRAME_AGE_S) -> FeatureEstimate:
         """Contact location and force of one finger now.
 
         The first call subscribes and waits up to the client's timeout for a first estimate. The
@@ -167,7 +172,7 @@ class Client(Closing):
         """
         return self._latest(FEATURES, sensor, max_age_s)
 
-    def electrodes(self, sensor: str, *, max_age_s: float = 0.05) -> ElectrodeFrame:
+    def electrodes(self, sensor: str, *, max_age_s: float = FRAME_AGE_S) -> ElectrodeFrame:
         """Raw counts of one finger now; see ``features``."""
         return self._latest(ELECTRODES, sensor, max_age_s)
 
@@ -252,19 +257,20 @@ class Client(Closing):
     ) -> FeatureEstimate:
         """Ask for the features of one frame, however old it is; old ones are flagged ``STALE``.
 
-        Without a frame it is the sensor's newest, see ``electrodes``. ``on_timings`` is told where
-        the time went.
+        Without a frame it is the sensor's newest, see ``electrodes``; waiting for the first one is
+        part of ``timeout_s``. ``on_timings`` is told where the time went.
 
         Raises:
             LinkError: No features service runs.
             RemoteError: It has no estimate for this frame, e.g. because the frame is not tared.
             StaleError: No frame is given and none is young enough.
         """
+        frame, left_s = self._frame_to_ask_about(sensor, frame, timeout_s)
         return self.session.query(
             endpoints.ESTIMATE_FEATURES,
-            FeatureRequest(sensor, frame if frame is not None else self.electrodes(sensor)),
+            FeatureRequest(sensor, frame),
             service="features",
-            timeout_s=self._timeout_s if timeout_s is None else timeout_s,
+            timeout_s=left_s,
             on_timings=on_timings,
         )
 
@@ -288,11 +294,12 @@ class Client(Closing):
                 bundle has no reduced form.
             StaleError: No frame is given and none is young enough.
         """
+        frame, left_s = self._frame_to_ask_about(sensor, frame, timeout_s)
         return self.session.query(
             endpoints.ESTIMATE_FIELD,
-            FieldRequest(sensor, frame if frame is not None else self.electrodes(sensor), reduced),
+            FieldRequest(sensor, frame, reduced),
             service="field",
-            timeout_s=self._timeout_s if timeout_s is None else timeout_s,
+            timeout_s=left_s,
             on_timings=on_timings,
         )
 
@@ -540,7 +547,20 @@ class Client(Closing):
             self._streams.append(stream)
         return stream
 
-    def _latest(self, topic: Topic[M], sensor: str, max_age_s: float) -> M:
+    def _frame_to_ask_about(
+        self, sensor: str, frame: ElectrodeFrame | None, timeout_s: float | None
+    ) -> tuple[ElectrodeFrame, float]:
+        """The given frame, or the newest, and how much of the time is left then [s]."""
+        wait_s = self._timeout_s if timeout_s is None else timeout_s
+        if frame is not None:
+            return frame, wait_s
+        end_s = time.monotonic() + check_duration(wait_s, "timeout_s", most=LONGEST_S)
+        newest = self._latest(ELECTRODES, sensor, FRAME_AGE_S, wait_s=wait_s)
+        return newest, max(end_s - time.monotonic(), _LEAST_S)
+
+    def _latest(
+        self, topic: Topic[M], sensor: str, max_age_s: float, *, wait_s: float | None = None
+    ) -> M:
         check_process()
         session = self.session
         check_duration(max_age_s, "max_age_s", most=math.inf)
@@ -551,7 +571,8 @@ class Client(Closing):
                 made = session.subscriber(topic, sensor=sensor, delivery=Delivery.NEWEST)
                 self._newest[key] = made, SameSensor(made.key), threading.Lock()
             subscriber, same, lock = self._newest[key]
-        end_s = time.monotonic() + (self._timeout_s if first else 0.0)
+        first_s = self._timeout_s if wait_s is None else wait_s
+        end_s = time.monotonic() + (first_s if first else 0.0)
         with lock:
             while True:
                 try:
