@@ -174,6 +174,13 @@ def test_no_router_is_said_and_what_to_do(free_port: int, direct: bool) -> None:
         Session.open(link)
 
 
+@pytest.mark.parametrize("direct", [True, False])
+def test_a_host_that_cannot_be_is_said(direct: bool) -> None:
+    link = LinkConfig(connect=("tcp/lab..pc:7447",), wait_for_router_s=0.3, direct=direct)
+    with pytest.raises(LinkError, match=r"lab\.\.pc:7447"):
+        Session.open(link)
+
+
 def test_port_in_use_is_said_and_what_to_do(link: LinkConfig) -> None:
     time.sleep(0.3)
     with pytest.raises(LinkError, match="port in use: tcp/"):
