@@ -204,9 +204,13 @@ class Queryable(Declared):
         except PalpateError as error:
             self._reject(answer, error)
             return
-        waiting = self._waiting.qsize()
-        if waiting < self._capacity:
-            self._waiting.put((query, answer))
+        with self._lock:
+            closed, waiting = self.closed, self._waiting.qsize()
+            if not closed and waiting < self._capacity:
+                self._waiting.put((query, answer))
+                return
+        if closed:  # Zenoh still hands over what came before it was undeclared
+            answer.fail(_stopping(self.key))
             return
         self._count("refused_full")
         answer.fail(
@@ -289,7 +293,8 @@ class Queryable(Declared):
 
     def close(self) -> None:
         """Undeclare; what was accepted is still handled, or refused if that takes too long."""
-        self.closed = True
+        with self._lock:
+            self.closed = True
         self._queryable.undeclare()
         for _ in self._workers:
             self._waiting.put(None)
