@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,8 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 
 from palpate.bus import MAX_PAYLOAD_BYTES, Cancellation, QueryAnswer, Session, endpoints
+from palpate.bus.presence import CallerWatch
 from palpate.bus.topics import caller_key
 from palpate.client import Client
 from palpate.client.simulations import ask_simulation, join, straight_path
@@ -276,6 +279,24 @@ def test_who_waits_no_longer_is_noticed(
             time.sleep(0.3)
             assert caller_key("lab", "again") not in gone
         wait_until(lambda: caller_key("lab", "again") in gone)
+
+
+def test_a_look_that_fails_hides_no_caller_that_is_gone() -> None:
+    """Its error was taken for a token, and the simulation went on for nobody."""
+    told: queue.SimpleQueue[str] = queue.SimpleQueue()
+    heard: list[Callable[[Any], None]] = []
+
+    def declared(_: str, on_sample: Callable[[Any], None], *, history: bool) -> object:
+        heard.append(on_sample)
+        return SimpleNamespace(undeclare=lambda: None)
+
+    failed = SimpleNamespace(ok=None, err="Timeout")
+    looks = SimpleNamespace(get=lambda *_, **__: [failed], declare_subscriber=declared)
+    session: Any = SimpleNamespace(liveliness=lambda: looks)
+    key = caller_key("lab", "r")
+    with CallerWatch(session, caller_key("lab", "*"), lambda gone, _: told.put(gone)):
+        heard[0](SimpleNamespace(kind=zenoh.SampleKind.DELETE, key_expr=key))
+        assert told.get(timeout=5.0) == key
 
 
 class TwoServices:
