@@ -27,6 +27,7 @@ from palpate.errors import (
     ConfigError,
     LinkError,
     SensorChanged,
+    StaleError,
     StreamTimeout,
 )
 from palpate.messages import (
@@ -125,7 +126,7 @@ def test_an_async_stream_delivers_nothing_that_grew_old_while_its_task_was_busy(
     async def scene() -> None:
         async with (
             AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot,
-            robot.stream_features("finger", max_age_s=0.2) as stream,
+            robot.stream_features("finger", max_age_s=0.2, timeout_s=2.0) as stream,
         ):
             await anext(stream)
             while not stream.counters["skipped"]:  # one waits for the task
@@ -133,6 +134,8 @@ def test_an_async_stream_delivers_nothing_that_grew_old_while_its_task_was_busy(
             finger.silent = True
             await asyncio.sleep(0.5)  # and is too old now
             before = finger.sequence
+            with pytest.raises(StaleError):
+                await anext(stream)
             finger.silent = False
             assert (await anext(stream)).source.sequence > before
             assert stream.counters["stale"] > 0

@@ -25,7 +25,7 @@ from palpate.bus.zenoh_session import check_process, is_inherited
 from palpate.client.robot import Client
 from palpate.client.streams import Stream, Watch, check_depth
 from palpate.config import TlsConfig
-from palpate.errors import LinkError, PalpateError, SensorChanged, StaleError
+from palpate.errors import LinkError, PalpateError, SensorChanged, StaleError, StreamTimeout
 
 M = TypeVar("M")
 P = ParamSpec("P")
@@ -81,6 +81,7 @@ class AsyncStream(Generic[M]):
         stream = self._stream
         end_s = time.monotonic() + (math.inf if stream is None else stream.timeout_s)
         item: ReceivedMessage[M] | PalpateError | None
+        stale: StaleError | None = None
         while not self._closed:
             with self._lock:
                 item = None
@@ -95,13 +96,14 @@ class AsyncStream(Generic[M]):
             if item is None:
                 await self._arrived.wait()
             elif isinstance(item, PalpateError):
-                raise item
+                raise stale if stale and isinstance(item, StreamTimeout) else item
             else:
                 assert stream is not None, "its message is here"
                 try:
                     stream.check_age(item)  # it has waited here
-                except StaleError:
+                except StaleError as error:
                     self._stale += 1
+                    stale = error
                     if time.monotonic() >= end_s:
                         raise
                 else:
