@@ -27,6 +27,7 @@ from palpate.errors import (
     ConfigError,
     LinkError,
     SensorChanged,
+    StaleError,
     StreamTimeout,
 )
 from palpate.messages import (
@@ -115,6 +116,29 @@ def test_an_async_stream_says_that_it_is_silent_and_goes_on(
             await stream.aclose()
             with pytest.raises(StopAsyncIteration):
                 await anext(stream)
+
+    asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
+
+
+def test_an_async_stream_delivers_nothing_that_grew_old_while_its_task_was_busy(
+    link: LinkConfig, finger: Finger
+) -> None:
+    async def scene() -> None:
+        async with (
+            AsyncClient(link.connect[0], timeout_s=LIVE_S) as robot,
+            robot.stream_features("finger", max_age_s=0.2, timeout_s=2.0) as stream,
+        ):
+            await anext(stream)
+            while not stream.counters["skipped"]:  # one waits for the task
+                await asyncio.sleep(0.01)
+            finger.silent = True
+            await asyncio.sleep(0.5)  # and is too old now
+            before = finger.sequence
+            with pytest.raises(StaleError):
+                await anext(stream)
+            finger.silent = False
+            assert (await anext(stream)).source.sequence > before
+            assert stream.counters["stale"] > 0
 
     asyncio.run(asyncio.wait_for(scene(), 3 * LIVE_S))
 

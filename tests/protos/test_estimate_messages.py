@@ -155,11 +155,12 @@ def test_a_synthesis_is_asked_for_from_three_sources(examples: dict[str, Any]) -
     contact = ContactDescription("cube", (0.0, 0.0, -0.01), (0.0, 0.1, 2.0), depth_m=0.001)
     simulation: SimulationRequest = examples["SimulationRequest"]
     for source in (examples["FieldFrame"], contact, simulation):
-        request = SynthesisRequest(source, "slow-twin", 12.5)
+        request = SynthesisRequest(source, "slow-twin", 12.5, request_id="mine")
         payload = codec.SYNTHESIS_REQUEST.encode(request)
         came = codec.SYNTHESIS_REQUEST.decode(payload)
         assert type(came.source) is type(source)
         assert (came.simulator, came.deadline_s, came.every_step) == ("slow-twin", 12.5, False)
+        assert came.request_id == "mine"
     assert codec.SYNTHESIS_REQUEST.decode(payload).source == simulation
     assert isinstance(simulation.parameters, SimulationParameters)
     nameless = requests_pb2.SynthesisRequest.FromString(payload)

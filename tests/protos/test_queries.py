@@ -16,7 +16,7 @@ import zenoh
 
 from palpate.bus import MAX_PAYLOAD_BYTES, Cancellation, Session, endpoints
 from palpate.bus.query import LONGEST_S, ask_again
-from palpate.bus.topics import sensor_key
+from palpate.bus.topics import sensor_key, service_key
 from palpate.config import LinkConfig, parse_config
 from palpate.errors import (
     ConfigError,
@@ -132,6 +132,22 @@ def test_a_service_that_is_not_there_is_not_blamed_for_its_answer(pair: Any) -> 
     _, b = pair
     with pytest.raises(LinkError, match=NOBODY):
         _tare(b)
+
+
+def test_a_process_that_is_there_and_does_not_answer_is_not_said_to_be_absent(
+    pair: Any, wait_until: Callable[..., None]
+) -> None:
+    """Zenoh does not tell who serves a key with wildcards."""
+    a, b = pair
+    a.presence("features", instance="one").ready()
+    a._raw.declare_queryable(
+        service_key("lab", "features", "one", "model"), lambda query: query.drop(), complete=True
+    )
+    wait_until(lambda: any(one.ready for one in b.alive()), timeout_s=TIMEOUT_S)
+    with pytest.raises(LinkError, match="is served, but no answer"):
+        b.query(endpoints.MODEL, ServiceRequest(), service="features", timeout_s=TIMEOUT_S)
+    with pytest.raises(LinkError, match="no service answers"):
+        b.query(endpoints.MODEL, ServiceRequest(), service="field", timeout_s=TIMEOUT_S)
 
 
 def test_a_long_wait_is_not_waited_out_where_nobody_serves(pair: Any) -> None:

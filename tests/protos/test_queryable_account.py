@@ -291,6 +291,14 @@ def test_closing_answers_what_a_hanging_handler_keeps_waiting(
     go.set()
 
 
+def test_a_question_that_zenoh_hands_over_after_the_end_is_refused(tare: Tare) -> None:
+    asked = Asked(lambda _: tare)
+    asked.queryable.close()
+    (error,) = asked.ask(Query(None)).errors
+    assert error.code is ErrorCode.UNAVAILABLE
+    assert error.retry_after_s > 0
+
+
 def test_an_error_of_any_length_and_any_text_arrives() -> None:
     reply = error_reply(ValueError("a\udcff" + "x" * 10_000_000))
     arrived = ERROR.decode(ERROR.encode(reply))

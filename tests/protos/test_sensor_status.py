@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from typing import Any
 
 import numpy as np
 import pytest
 
 from palpate.codec import STATUS, WRENCH_ZERO
-from palpate.errors import WireError
+from palpate.errors import RecordingError, WireError
 from palpate.health import Health
 from palpate.messages import (
     GAUGE_MAX,
@@ -18,6 +19,7 @@ from palpate.messages import (
     FaultKind,
     SensorState,
     SensorStatus,
+    ServiceState,
     Status,
     SupervisedProcess,
 )
@@ -117,6 +119,21 @@ def test_nor_is_it_taken_when_it_comes(examples: dict[str, Any], value: float) -
     for message in (whole, child, time):
         with pytest.raises(WireError):
             STATUS.decode(message.SerializeToString())
+
+
+def test_a_file_name_that_is_no_utf_8_keeps_no_status_from_being_sent() -> None:
+    name = os.fsdecode(b"/data/m\xfcller/x.mcap")
+    health = Health("recorder", "recorder")
+    health.set_state(ServiceState.READY, f"writes {name}")
+    health.set_sensor_state("finger", SensorState.LOST, message=f"{name} has ended")
+    came = STATUS.decode(STATUS.encode(health.status()))
+    assert came.message == "writes /data/m\\udcfcller/x.mcap"
+    assert came.sensor_states[0].message == "/data/m\\udcfcller/x.mcap has ended"
+    health.fail(RecordingError(f"{name}: disk full", remedy=f"move {name}"))
+    came = STATUS.decode(STATUS.encode(health.status()))
+    assert came.last_error is not None
+    assert came.message == came.last_error.message == "/data/m\\udcfcller/x.mcap: disk full"
+    assert came.last_error.remedy == "move /data/m\\udcfcller/x.mcap"
 
 
 def test_long_words_are_cut_when_sent_and_refused_when_they_come(examples: dict[str, Any]) -> None:

@@ -174,6 +174,13 @@ def test_no_router_is_said_and_what_to_do(free_port: int, direct: bool) -> None:
         Session.open(link)
 
 
+@pytest.mark.parametrize("direct", [True, False])
+def test_a_host_that_cannot_be_is_said(direct: bool) -> None:
+    link = LinkConfig(connect=("tcp/lab..pc:7447",), wait_for_router_s=0.3, direct=direct)
+    with pytest.raises(LinkError, match=r"lab\.\.pc:7447"):
+        Session.open(link)
+
+
 def test_port_in_use_is_said_and_what_to_do(link: LinkConfig) -> None:
     time.sleep(0.3)
     with pytest.raises(LinkError, match="port in use: tcp/"):
@@ -256,6 +263,26 @@ def test_a_robot_needs_five_lines(
     finally:
         stop.set()
         server.join()
+
+
+@pytest.mark.parametrize("name", ["estimate_features", "estimate_field"])
+def test_the_first_frame_is_waited_for_within_the_time_of_the_question(
+    link: LinkConfig, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    waits: list[float] = []
+    wait = Subscriber.next
+
+    def noted(self: Subscriber[Any], timeout_s: float) -> Any:
+        waits.append(timeout_s)
+        return wait(self, timeout_s)
+
+    monkeypatch.setattr(Subscriber, "next", noted)
+    with Client(link.connect[0], timeout_s=2.0) as robot:
+        with pytest.raises(StaleError, match="has arrived yet"):
+            getattr(robot, name)("elbow", timeout_s=0.1)
+        assert 0.0 < max(waits) <= 0.1, "not the client's"
+        with pytest.raises(ConfigError, match="timeout_s"):
+            getattr(robot, name)("elbow", timeout_s=-1.0)
 
 
 def test_only_the_first_call_of_a_sensor_waits(

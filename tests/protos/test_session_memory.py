@@ -8,11 +8,13 @@ import os
 import subprocess
 import sys
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from tests.protos.robot_client import Finger
 
 from palpate.bus import Delivery, Session, endpoints
 from palpate.bus.link import _close_all
@@ -154,6 +156,28 @@ def test_a_session_whose_closing_was_interrupted_is_closed_at_the_end(
     _close_all()
     with pytest.raises(LinkError, match="closed"):
         session.publisher(ELECTRODES, sensor="finger")
+
+
+def test_clients_that_nobody_holds_leave_the_bus(
+    link: LinkConfig, finger: Finger, wait_until: Callable[..., None]
+) -> None:
+    """Zenoh's sessions lived on behind them, and nobody could close them."""
+    before = sockets()
+    for _ in range(3):
+        Client(link.connect[0], timeout_s=PATIENCE_S).features("finger", max_age_s=PATIENCE_S)
+    gc.collect()
+    wait_until(lambda: sockets() <= before, PATIENCE_S)
+
+
+def test_a_pose_publisher_in_use_keeps_its_client(
+    link: LinkConfig, wait_until: Callable[..., None]
+) -> None:
+    poses = Client(link.connect[0], timeout_s=PATIENCE_S).robot_pose_publisher("arm")
+    gc.collect()
+    time.sleep(0.5)  # for who would leave the bus
+    poses.put((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    wait_until(lambda: poses.counters["published"] == 1, PATIENCE_S)
+    poses.close()
 
 
 _PEER = """

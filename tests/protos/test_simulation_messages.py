@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,8 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 
-from palpate.bus import MAX_PAYLOAD_BYTES, QueryAnswer, Session, endpoints
+from palpate.bus import MAX_PAYLOAD_BYTES, Cancellation, QueryAnswer, Session, endpoints
+from palpate.bus.presence import CallerWatch
 from palpate.bus.topics import caller_key
 from palpate.client import Client
 from palpate.client.simulations import ask_simulation, join, straight_path
@@ -22,6 +25,7 @@ from palpate.config import LinkConfig
 from palpate.errors import (
     ErrorCode,
     LinkError,
+    PalpateError,
     RemoteError,
     ReplicaDiffers,
     SimulationError,
@@ -277,6 +281,24 @@ def test_who_waits_no_longer_is_noticed(
         wait_until(lambda: caller_key("lab", "again") in gone)
 
 
+def test_a_look_that_fails_hides_no_caller_that_is_gone() -> None:
+    """Its error was taken for a token, and the simulation went on for nobody."""
+    told: queue.SimpleQueue[str] = queue.SimpleQueue()
+    heard: list[Callable[[Any], None]] = []
+
+    def declared(_: str, on_sample: Callable[[Any], None], *, history: bool) -> object:
+        heard.append(on_sample)
+        return SimpleNamespace(undeclare=lambda: None)
+
+    failed = SimpleNamespace(ok=None, err="Timeout")
+    looks = SimpleNamespace(get=lambda *_, **__: [failed], declare_subscriber=declared)
+    session: Any = SimpleNamespace(liveliness=lambda: looks)
+    key = caller_key("lab", "r")
+    with CallerWatch(session, caller_key("lab", "*"), lambda gone, _: told.put(gone)):
+        heard[0](SimpleNamespace(kind=zenoh.SampleKind.DELETE, key_expr=key))
+        assert told.get(timeout=5.0) == key
+
+
 class TwoServices:
     """A session of which the first service is lost after some steps, and another one takes over."""
 
@@ -319,3 +341,41 @@ def test_steps_of_two_services_that_went_different_ways_are_not_joined() -> None
         ask(1.02, lambda number, _: told.append(number))
     assert told == [0, 1]
     assert len(ask(1.02, None).steps) == 3, "the reply is of the second one alone"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        LinkError("the gripper is not connected", remedy="connect it"),
+        RemoteError("the arm is busy", remedy="wait", code=ErrorCode.UNAVAILABLE),
+    ],
+)
+@pytest.mark.parametrize("what", ["on_step", "on_progress"])
+def test_an_error_of_the_caller_itself_asks_no_other_service(
+    error: PalpateError, what: str
+) -> None:
+    told: list[object] = []
+
+    def fail(*values: object) -> None:
+        told.append(values)
+        raise error
+
+    begun = part(0, progress=SimulationProgress("r", 1, 2, 0.5))
+    session: Any = TwoServices([begun, LAST], [begun, LAST])
+    with pytest.raises(type(error)) as caught:
+        ask_simulation(session, REQUEST, sensor="twin", timeout_s=20.0, **{what: fail})
+    assert caught.value is error
+    assert len(told) == 1
+
+
+def test_a_cancelled_simulation_is_asked_of_no_other_service() -> None:
+    cancellation = Cancellation()
+    session: Any = TwoServices([part(0), part(1)], [part(0), part(1), LAST])
+    with cancellation, pytest.raises(LinkError, match="it was lost"):
+        ask_simulation(
+            session,
+            REQUEST,
+            sensor="twin",
+            timeout_s=20.0,
+            on_step=lambda number, _: cancellation.cancel() if number == 1 else None,
+        )

@@ -13,15 +13,17 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from palpate.bus import Delivery, Session, SiteLink, run_router
+from palpate.bus import router as router_module
 from palpate.bus.topics import ELECTRODES
 from palpate.client import Client
 from palpate.config import LinkConfig
-from palpate.errors import StationTaken, StreamTimeout
+from palpate.errors import ConfigError, StationTaken, StreamTimeout
 
 PATIENCE_S = 60.0
 
@@ -131,6 +133,26 @@ def test_the_second_station_of_a_name_goes_on_without_the_site(examples: dict[st
         until(lambda: second.connected)
         assert second.refusal is None
         until(lambda: sends(gateway, frame, heard))
+
+
+def test_a_name_is_claimed_although_its_certificates_were_being_renewed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nobody guarded the name from then on, and a second station of it joined the site."""
+    errors = [ConfigError("the key is of another certificate", remedy="issue both again")]
+
+    def opened(link: LinkConfig, *, station: str) -> Session:
+        if errors:
+            raise errors.pop()
+        return Session.open(link, station=station)
+
+    monkeypatch.setattr(router_module, "Session", SimpleNamespace(open=opened))
+    site = free_endpoint()
+    with router(site), station("arm1", site) as (_, first):
+        until(lambda: first.connected)
+        with station("arm1", site) as (_, second):
+            until(lambda: second.refusal is not None)
+        assert first.refusal is None
 
 
 def test_a_station_starts_without_its_site_and_finds_it_later(examples: dict[str, Any]) -> None:

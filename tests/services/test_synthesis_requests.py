@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from palpate.bus import QueryAnswer, Session, endpoints
+from palpate.bus import Cancellation, QueryAnswer, Session, endpoints
+from palpate.bus.topics import caller_key
 from palpate.client import Client
 from palpate.config import LinkConfig
-from palpate.errors import ErrorCode, RemoteError
+from palpate.errors import ErrorCode, PalpateError, RemoteError
 from palpate.files.bundle import read_bundle
+from palpate.health import Health
 from palpate.messages import (
     ContactDescription,
     ElectrodeFrame,
@@ -27,13 +32,20 @@ from palpate.messages import (
     SimulationStep,
     SynthesisEstimate,
     SynthesisReply,
+    SynthesisRequest,
 )
 from palpate.rigid import rotation_matrices
 from palpate_services.config import SynthesisServiceConfig
 from palpate_services.inference.estimates import synthesise
 from palpate_services.inference.model import load
 from palpate_services.inference.services import run_estimating
-from palpate_services.inference.synthesis_requests import CLEARANCE_M, DEEPEST_M, STEP_M, path_of
+from palpate_services.inference.synthesis_requests import (
+    CLEARANCE_M,
+    DEEPEST_M,
+    STEP_M,
+    SynthesisRequests,
+    path_of,
+)
 
 bundles: Any = importlib.import_module("field_bundles")
 
@@ -162,7 +174,56 @@ def test_a_contact_to_a_force_ends_there_and_so_does_its_simulation(
     assert np.linalg.norm(reply.step.force) == pytest.approx(0.73, rel=1e-6)
     assert fem.depth_m(reply.step.pose_sensor_indenter) == pytest.approx(0.73e-3, abs=2e-5)
     assert reply.outcome is SimulationOutcome.COMPLETE
-    until(lambda: len(fem.gone) == 1)  # the simulation is told that nobody waits
+    # The simulation is told that nobody waits.
+    until(lambda: caller_key("lab", fem.requests[0].request_id) in fem.gone)
+
+
+def test_a_simulation_is_stopped_when_its_caller_has_left(
+    robot: Client, fem: Fem, until: Until
+) -> None:
+    left = Cancellation()
+
+    def ask() -> None:
+        with left, pytest.raises(PalpateError):
+            robot.synthesise_from(_contact(depth_m=0.5e-3), timeout_s=20.0)
+
+    fem.hold.clear()
+    asking = threading.Thread(target=ask)
+    asking.start()
+    until(lambda: len(fem.requests) == 1)
+    left.cancel()
+    asking.join()
+    # The token of the service vanishes, by which the finite-element service knows.
+    until(lambda: caller_key("lab", fem.requests[0].request_id) in fem.gone)
+
+
+def test_of_a_caller_that_left_before_its_turn_nothing_is_simulated() -> None:
+    cancelled: list[bool] = []
+
+    def query_stream(*_: Any, **__: Any) -> Iterator[SimulationReply]:
+        current = Cancellation.current()
+        cancelled.append(current is not None and current.cancelled.is_set())
+        return iter(())
+
+    session: Any = SimpleNamespace(
+        station="lab", caller_token=lambda _: contextlib.nullcontext(), query_stream=query_stream
+    )
+    models: Any = SimpleNamespace(of=lambda _: object())
+    requests = SynthesisRequests(
+        session, SynthesisServiceConfig(), models, Health("synthesis", "one")
+    )
+    now_s = time.monotonic()
+    requests.caller_gone(caller_key("lab", "left"), now_s)
+    simulation = SimulationRequest("mine", "cube", path_of(_contact(depth_m=1e-3), bundles.skin()))
+    for request_id, asked_s in (("left", now_s - 1.0), ("left", now_s + 1.0), ("waits", now_s)):
+        answer: Any = SimpleNamespace(
+            arrived_ns=round(1e9 * asked_s),
+            deadline_s=now_s + 60.0,
+            send=lambda _: None,
+            end=lambda: None,
+        )
+        requests.handle(SynthesisRequest(simulation, request_id=request_id), answer)
+    assert cancelled == [True, False, False], "who asks again by the same id has not left"
 
 
 def test_a_force_that_is_not_reached_is_said(robot: Client, fem: Fem) -> None:

@@ -7,7 +7,6 @@ import contextlib
 import secrets
 import threading
 import time
-import weakref
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from functools import partial
@@ -80,7 +79,8 @@ R = TypeVar("R")
 K = TypeVar("K", bound=Declared)
 
 
-_open: weakref.WeakSet[Session] = weakref.WeakSet()
+_open: set[Session] = set()
+"""Held until they are closed: Zenoh's session would live on, and nobody could close it."""
 
 
 @atexit.register

@@ -58,7 +58,7 @@ def _why_no_link(link: LinkConfig, endpoint: str) -> LinkError | None:
             f"what listens at {endpoint} does not speak TLS",
             remedy=f"without certificates connect to tcp/{place}",
         )
-    except OSError:
+    except (OSError, UnicodeError):  # UnicodeError: no host can have such a name
         return None
     hint = f"connect to tls/{place} if it wants certificates; " if protocol == "tcp" else ""
     return LinkError(

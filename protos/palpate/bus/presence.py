@@ -136,7 +136,8 @@ class CallerWatch(Declared):
             try:
                 # The end of a token may be reported after the request of the next call, whose
                 # token was declared before that request and is found here.
-                if not any(self._session.liveliness().get(key, timeout=_LOOK_S)):
+                found = self._session.liveliness().get(key, timeout=_LOOK_S)
+                if not any(reply.ok is not None for reply in found):
                     self._on_gone(key, when_s)
             except zenoh.ZError:  # the session is closing
                 return

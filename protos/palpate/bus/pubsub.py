@@ -313,13 +313,13 @@ class Subscriber(Generic[M], Declared):
         self._lock = threading.Lock()
         self._reading = threading.Lock()
         self._waits = False
+        self._ring: Ring | None = None
         self._arrivals: _Ringed | _Queued
         if delivery is Delivery.NEWEST:
             self._depth: float = depth
-            self._ring_capacity = _RING if topic.priority <= Priority.REAL_TIME else _RING_LARGE
-            self._arrivals = _Ringed(
-                Ring(session, key, capacity=self._ring_capacity, alarm=alarm), self._counters
-            )
+            kept = _RING if topic.priority <= Priority.REAL_TIME else _RING_LARGE
+            self._ring = Ring(session, key, capacity=kept, alarm=alarm)
+            self._arrivals = _Ringed(self._ring, self._counters)
         else:
             self._depth = math.inf
             sender_waits = delivery is Delivery.EVERY
@@ -486,12 +486,13 @@ class Subscriber(Generic[M], Declared):
 
     def _look(self) -> None:
         """Check what has arrived in the ring, unless a thread waits there: it checks it at once."""
-        if not self._newest_wins or self._waits:
+        if self._ring is None or self._waits:
             return
+        before = self._ring.polled
         arrivals: list[Arrival] = []
         while (arrival := self._arrivals.poll()) is not None:
             arrivals.append(arrival)
-        if len(arrivals) >= self._ring_capacity:
+        if self._ring.polled - before >= self._ring.capacity:
             # A full ring has dropped what came before, nobody knows how much of which source.
             for source in self._sources.values():
                 if source.continuity is not None:

@@ -19,8 +19,14 @@ import zenoh
 
 from palpate.bus.attachments import OnTimings, attachment_of, timings_of
 from palpate.bus.endpoints import Endpoint
-from palpate.bus.presence import alive, other_stations
-from palpate.bus.topics import ENCODING_PREFIX, MAX_MESSAGE_BYTES, check_schema, check_size
+from palpate.bus.presence import AliveService, alive, other_stations
+from palpate.bus.topics import (
+    ENCODING_PREFIX,
+    MAX_MESSAGE_BYTES,
+    check_schema,
+    check_size,
+    service_key,
+)
 from palpate.bus.zenoh_session import said, while_open
 from palpate.codec import ERROR
 from palpate.config import check_duration
@@ -292,11 +298,17 @@ def no_reply(
     """The error for a question that had no reply at all: nobody serves it, or the reply was lost.
 
     Zenoh tells neither. If nobody was ``known`` to serve the key when it was asked, that is looked
-    up once more here. With ``roles`` the question may also have been refused on its way, of which
-    Zenoh does not tell either. ``device`` is what the question is put to, if only gateways answer.
-    ``station`` is the one of the key.
+    up once more here; of a key of any instance of a service, by whether one is ready. With
+    ``roles`` the question may also have been refused on its way, of which Zenoh does not tell
+    either. ``device`` is what the question is put to, if only gateways answer. ``station`` is the
+    one of the key.
     """
     served = known or is_served(session, key, LOOK_S)
+    found: list[AliveService] = []
+    if not served:
+        with while_open():
+            found = alive([session], "*", timeout_s=LOOK_S)
+        served = any(one.ready and _is_asked(one, key) for one in found)
     if roles and served:
         return LinkError(
             f"{key} is served, but no answer arrived: the role of this certificate may not ask it, "
@@ -309,9 +321,7 @@ def no_reply(
             f"or its answer is {_DROPPED}",
             remedy="ask again; if that fails, ask for less and look at the log of the service",
         )
-    with while_open():
-        others = other_stations(alive([session], "*", timeout_s=LOOK_S), station)
-    if others:
+    if others := other_stations(found, station):
         return LinkError(
             f"no process of station {station!r} runs: nobody answers on {key}",
             remedy="start it with `palpate up`, or name another one that this router sees, "
@@ -326,6 +336,11 @@ def no_reply(
         f"no service answers on {key}",
         remedy="start the service: palpate up; see what runs: palpate status",
     )
+
+
+def _is_asked(one: AliveService, key: str) -> bool:
+    """Whether a question under this key goes to any instance of the service that this is."""
+    return key == service_key(one.station, one.service, "*", key.rpartition("/")[2])
 
 
 def is_served(session: zenoh.Session, key: str, wait_s: float) -> bool:

@@ -57,8 +57,6 @@ def error_reply(error: BaseException) -> ErrorReply:
 
 
 def _short(text: str) -> str:
-    # Lone surrogates, e.g. of a file name that is no UTF-8, cannot be sent.
-    text = text.encode("utf-8", "backslashreplace").decode()
     left_out = len(text) - _TEXT_MOST
     return text if left_out <= 0 else f"{text[:_TEXT_MOST]} ... ({left_out} characters more)"
 
@@ -206,9 +204,13 @@ class Queryable(Declared):
         except PalpateError as error:
             self._reject(answer, error)
             return
-        waiting = self._waiting.qsize()
-        if waiting < self._capacity:
-            self._waiting.put((query, answer))
+        with self._lock:
+            closed, waiting = self.closed, self._waiting.qsize()
+            if not closed and waiting < self._capacity:
+                self._waiting.put((query, answer))
+                return
+        if closed:  # Zenoh still hands over what came before it was undeclared
+            answer.fail(_stopping(self.key))
             return
         self._count("refused_full")
         answer.fail(
@@ -291,7 +293,8 @@ class Queryable(Declared):
 
     def close(self) -> None:
         """Undeclare; what was accepted is still handled, or refused if that takes too long."""
-        self.closed = True
+        with self._lock:
+            self.closed = True
         self._queryable.undeclare()
         for _ in self._workers:
             self._waiting.put(None)

@@ -143,6 +143,8 @@ class Ring(Closing):
         self._session = session
         self._key = key
         self.closed = False
+        self.polled = 0
+        """How many samples ``poll`` has taken, those that end waits included."""
         self._wake_key = key.replace("*", "wake")
         self._alarm = alarm
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(capacity))
@@ -156,6 +158,7 @@ class Ring(Closing):
         """
         try:
             while (sample := self._samples.try_recv()) is not None:
+                self.polled += 1
                 if not is_wake(sample):
                     return sample
         except zenoh.ZError as error:

@@ -25,7 +25,7 @@ from palpate.bus.link import Session
 from palpate.bus.topics import STATION_ROOT
 from palpate.bus.zenoh_session import close_zenoh, open_zenoh, zenoh_config
 from palpate.config import LinkConfig
-from palpate.errors import ClaimedElsewhere, LinkError
+from palpate.errors import ClaimedElsewhere, ConfigError, LinkError
 from palpate.heartbeat import FILE_VARIABLE, beat
 from palpate.process import Closing
 
@@ -120,7 +120,7 @@ class _NameGuard(Closing):
         while not self._closed.is_set():
             try:
                 session = Session.open(self._link, station=self.site.station)
-            except LinkError:
+            except (LinkError, ConfigError):  # also while its certificates are renewed
                 self._closed.wait(_PERIOD_S)
                 continue
             with session:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,12 +20,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar
 
-from palpate.bus import Cancellation
+from palpate.bus import Cancellation, ReceivedMessage
 from palpate.bus.zenoh_session import check_process, is_inherited
 from palpate.client.robot import Client
 from palpate.client.streams import Stream, Watch, check_depth
 from palpate.config import TlsConfig
-from palpate.errors import LinkError, PalpateError, SensorChanged
+from palpate.errors import LinkError, PalpateError, SensorChanged, StaleError, StreamTimeout
 
 M = TypeVar("M")
 P = ParamSpec("P")
@@ -42,10 +44,12 @@ class AsyncStream(Generic[M]):
         self._loop = asyncio.get_running_loop()
         self._arrived = asyncio.Event()
         self._lock = threading.Lock()
-        self._items: deque[M | PalpateError] = deque(maxlen=depth)
+        self._items: deque[ReceivedMessage[M] | PalpateError] = deque(maxlen=depth)
         # Told once: no newer message may push it out.
         self._changed: SensorChanged | None = None
         self._skipped = 0
+        self._stale = 0
+        self._stream: Stream[M] | None = None
         self._watch: Watch[M] | None = None
         self._opening: asyncio.Task[None] | None = None
         self._closed = False
@@ -58,9 +62,13 @@ class AsyncStream(Generic[M]):
 
     @property
     def counters(self) -> dict[str, int]:
-        """Those of the stream, and ``skipped`` messages that the task was too slow for."""
+        """Those of the stream, and ``skipped`` messages that the task was too slow for.
+
+        ``stale`` has those, too, that grew too old while they waited for the task.
+        """
         counters = {} if self._watch is None else self._watch.counters
-        return {**counters, "skipped": self._skipped}
+        stale = counters.get("stale", 0) + self._stale
+        return {**counters, "stale": stale, "skipped": self._skipped}
 
     def __aiter__(self) -> Self:
         return self
@@ -70,24 +78,37 @@ class AsyncStream(Generic[M]):
         check_process()
         if self._watch is None and not self._closed:
             await self._opened()
-        item: M | PalpateError
+        stream = self._stream
+        end_s = time.monotonic() + (math.inf if stream is None else stream.timeout_s)
+        item: ReceivedMessage[M] | PalpateError | None
+        stale: StaleError | None = None
         while not self._closed:
             with self._lock:
+                item = None
                 if self._changed is not None:
                     item, self._changed = self._changed, None
-                    break
-                if self._items:
+                elif self._items:
                     item = self._items.popleft()
+                elif self._ended:
                     break
-                if self._ended:
-                    raise StopAsyncIteration
-                self._arrived.clear()
-            await self._arrived.wait()
-        else:
-            raise StopAsyncIteration
-        if isinstance(item, PalpateError):
-            raise item
-        return item
+                else:
+                    self._arrived.clear()
+            if item is None:
+                await self._arrived.wait()
+            elif isinstance(item, PalpateError):
+                raise stale if stale and isinstance(item, StreamTimeout) else item
+            else:
+                assert stream is not None, "its message is here"
+                try:
+                    stream.check_age(item)  # it has waited here
+                except StaleError as error:
+                    self._stale += 1
+                    stale = error
+                    if time.monotonic() >= end_s:
+                        raise
+                else:
+                    return item.message
+        raise StopAsyncIteration
 
     async def _opened(self) -> None:
         """Wait until it is open. Whoever waits may be cancelled: the opening goes on, once."""
@@ -97,13 +118,19 @@ class AsyncStream(Generic[M]):
 
     async def _open(self) -> None:
         def watch() -> Watch[M]:
-            return Watch(self._make(), self._offer, self._offer, self._end)
+            self._stream = stream = self._make()
+
+            def offer(_: M) -> None:
+                if stream.newest is not None:
+                    self._offer(stream.newest)
+
+            return Watch(stream, offer, self._offer, self._end)
 
         self._watch = await self._client.promptly(watch)
         if self._closed:  # meanwhile
             await self._client.promptly(self._watch.close)
 
-    def _offer(self, item: M | PalpateError) -> None:
+    def _offer(self, item: ReceivedMessage[M] | PalpateError) -> None:
         with self._lock:
             wake = not self._items
             if isinstance(item, SensorChanged):
@@ -194,6 +221,10 @@ class AsyncClient:
         async with AsyncClient() as robot:
             async for estimate in robot.stream_features("finger"):
                 print(estimate.force)
+
+    A stream stays open, with a thread that takes each message, until it or the client is closed:
+    before a ``break`` write ``async with robot.stream_features("finger") as estimates:`` around the
+    loop.
 
     Arguments are those of ``Client``; the bus is joined by ``async with``, and may be again after
     it was left or could not be joined. Functions that a method

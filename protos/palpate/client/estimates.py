@@ -98,20 +98,24 @@ def ask_synthesis(
 ) -> SynthesisReply:
     """The last reply to a request; ``on_step`` gets those before, if it asks for every step.
 
+    If this process ends or is interrupted, the token vanishes and the simulation is stopped.
+
     Raises:
         LinkError: No synthesis service runs.
         RemoteError: It, or the finite-element service that it asks, refuses or cannot go on.
         StreamTimeout: No answer in time.
         WireError: The request, or an answer, breaks the contract.
     """
-    parts = session.query_stream(
-        endpoints.SYNTHESISE_FROM, request, service="synthesis", timeout_s=timeout_s
-    )
-    for part in parts:
-        if not part.more:
-            return part
-        if on_step is not None:
-            on_step(part)
+    request = dataclasses.replace(request, request_id=uuid.uuid4().hex)
+    with session.caller_token(request.request_id):
+        parts = session.query_stream(
+            endpoints.SYNTHESISE_FROM, request, service="synthesis", timeout_s=timeout_s
+        )
+        for part in parts:
+            if not part.more:
+                return part
+            if on_step is not None:
+                on_step(part)
     raise _incomplete("it ended without a last message")
 
 

@@ -79,11 +79,16 @@ from palpate.process import Closing
 
 M = TypeVar("M")
 
+FRAME_AGE_S = 0.05
+"""Age of the oldest reading that is "now" by default [s]."""
+
 STREAM_AGE_S = 0.2
 """Age of the oldest reading that a stream delivers by default [s]."""
 
 STREAM_TIMEOUT_S = 10.0
 """Longest silence of a stream by default [s]: a restarted service is back earlier."""
+
+_LEAST_S = 1e-3
 
 
 _open: weakref.WeakSet[Client] = weakref.WeakSet()
@@ -96,8 +101,17 @@ def _close_all() -> None:
         client.close()
 
 
+def _leave(session: Session) -> None:
+    """Leave the bus for a client that nobody holds any more, in whatever thread that is noticed."""
+    if not is_inherited():
+        threading.Thread(target=session.close, name="leaving").start()
+
+
 class Client(Closing):
     """A robot's view of a station. Open one and keep it: joining and leaving take time.
+
+    One that is neither closed nor held leaves the bus in the background. What it has made and is in
+    use, a stream or a publisher of poses, holds it.
 
     Methods take the name of a ``sensor``, and as ``timeout_s`` how long an answer may take [s];
     None = the client's timeout.
@@ -135,16 +149,18 @@ class Client(Closing):
             joining_link(connect, wait_s=timeout_s, tls=tls), station=check_name(name, "station")
         )
         self._closed = False
+        self._dropped = weakref.finalize(self, _leave, self._session)
+        self._dropped.atexit = False  # then it is closed
         _open.add(self)
 
     @property
     def session(self) -> Session:
-        """What the client is connected by."""
+        """What the client is connected by; it is closed with it."""
         if self._closed:
             raise LinkError("the client is closed", remedy="open a new Client")
         return self._session
 
-    def features(self, sensor: str, *, max_age_s: float = 0.05) -> FeatureEstimate:
+    def features(self, sensor: str, *, max_age_s: float = FRAME_AGE_S) -> FeatureEstimate:
         """Contact location and force of one finger now.
 
         The first call subscribes and waits up to the client's timeout for a first estimate. The
@@ -156,7 +172,7 @@ class Client(Closing):
         """
         return self._latest(FEATURES, sensor, max_age_s)
 
-    def electrodes(self, sensor: str, *, max_age_s: float = 0.05) -> ElectrodeFrame:
+    def electrodes(self, sensor: str, *, max_age_s: float = FRAME_AGE_S) -> ElectrodeFrame:
         """Raw counts of one finger now; see ``features``."""
         return self._latest(ELECTRODES, sensor, max_age_s)
 
@@ -179,7 +195,9 @@ class Client(Closing):
         """Contact locations and forces of one finger as they come.
 
         ``for estimate in robot.stream_features("finger")`` iterates,
-        ``robot.stream_features("finger").call(function)`` calls back. The newest wins: a slow
+        ``robot.stream_features("finger").call(function)`` calls back. A loop that is left before
+        its end leaves the stream open, until it or the client is closed: write
+        ``with robot.stream_features("finger") as estimates:`` around it. The newest wins: a slow
         consumer finds the last ``depth`` messages, none older than ``max_age_s``. A silence of
         ``timeout_s`` is an error; None = wait for ever. See ``Stream``.
         """
@@ -239,19 +257,20 @@ class Client(Closing):
     ) -> FeatureEstimate:
         """Ask for the features of one frame, however old it is; old ones are flagged ``STALE``.
 
-        Without a frame it is the sensor's newest, see ``electrodes``. ``on_timings`` is told where
-        the time went.
+        Without a frame it is the sensor's newest, see ``electrodes``; waiting for the first one is
+        part of ``timeout_s``. ``on_timings`` is told where the time went.
 
         Raises:
             LinkError: No features service runs.
             RemoteError: It has no estimate for this frame, e.g. because the frame is not tared.
             StaleError: No frame is given and none is young enough.
         """
+        frame, left_s = self._frame_to_ask_about(sensor, frame, timeout_s)
         return self.session.query(
             endpoints.ESTIMATE_FEATURES,
-            FeatureRequest(sensor, frame if frame is not None else self.electrodes(sensor)),
+            FeatureRequest(sensor, frame),
             service="features",
-            timeout_s=self._timeout_s if timeout_s is None else timeout_s,
+            timeout_s=left_s,
             on_timings=on_timings,
         )
 
@@ -275,11 +294,12 @@ class Client(Closing):
                 bundle has no reduced form.
             StaleError: No frame is given and none is young enough.
         """
+        frame, left_s = self._frame_to_ask_about(sensor, frame, timeout_s)
         return self.session.query(
             endpoints.ESTIMATE_FIELD,
-            FieldRequest(sensor, frame if frame is not None else self.electrodes(sensor), reduced),
+            FieldRequest(sensor, frame, reduced),
             service="field",
-            timeout_s=self._timeout_s if timeout_s is None else timeout_s,
+            timeout_s=left_s,
             on_timings=on_timings,
         )
 
@@ -386,7 +406,7 @@ class Client(Closing):
         A gateway with the driver ``pose_zenoh``, whose option ``robot`` has the same name, turns
         them into poses of the indenter.
         """
-        publisher = RobotPosePublisher(self.session, check_name(robot, "robot"))
+        publisher = RobotPosePublisher(self.session, check_name(robot, "robot"), client=self)
         with self._lock:
             self._publishers = [one for one in self._publishers if not one.closed]
             self._publishers.append(publisher)
@@ -494,6 +514,7 @@ class Client(Closing):
         In a forked process nothing happens: the client is its parent's.
         """
         _open.discard(self)
+        self._dropped.detach()
         if is_inherited():
             return
         self._closed = True
@@ -526,7 +547,20 @@ class Client(Closing):
             self._streams.append(stream)
         return stream
 
-    def _latest(self, topic: Topic[M], sensor: str, max_age_s: float) -> M:
+    def _frame_to_ask_about(
+        self, sensor: str, frame: ElectrodeFrame | None, timeout_s: float | None
+    ) -> tuple[ElectrodeFrame, float]:
+        """The given frame, or the newest, and how much of the time is left then [s]."""
+        wait_s = self._timeout_s if timeout_s is None else timeout_s
+        if frame is not None:
+            return frame, wait_s
+        end_s = time.monotonic() + check_duration(wait_s, "timeout_s", most=LONGEST_S)
+        newest = self._latest(ELECTRODES, sensor, FRAME_AGE_S, wait_s=wait_s)
+        return newest, max(end_s - time.monotonic(), _LEAST_S)
+
+    def _latest(
+        self, topic: Topic[M], sensor: str, max_age_s: float, *, wait_s: float | None = None
+    ) -> M:
         check_process()
         session = self.session
         check_duration(max_age_s, "max_age_s", most=math.inf)
@@ -537,7 +571,8 @@ class Client(Closing):
                 made = session.subscriber(topic, sensor=sensor, delivery=Delivery.NEWEST)
                 self._newest[key] = made, SameSensor(made.key), threading.Lock()
             subscriber, same, lock = self._newest[key]
-        end_s = time.monotonic() + (self._timeout_s if first else 0.0)
+        first_s = self._timeout_s if wait_s is None else wait_s
+        end_s = time.monotonic() + (first_s if first else 0.0)
         with lock:
             while True:
                 try:

@@ -32,10 +32,14 @@ class RobotPosePublisher(Closing):
     """Publishes one robot's poses; ``put`` belongs to one thread.
 
     ``counters``: ``put``, ``published``, and ``dropped`` of poses that waited too long for the bus.
-    A dropped pose leaves a hole in the sequence, so the gateway counts it, too.
+    A dropped pose leaves a hole in the sequence, so the gateway counts it, too. ``client`` is whose
+    it is; it stays open until the publisher is closed.
     """
 
-    def __init__(self, session: Session, robot: str, *, waiting: int = WAITING) -> None:
+    def __init__(
+        self, session: Session, robot: str, *, waiting: int = WAITING, client: object = None
+    ) -> None:
+        self._client = client
         self._robot = robot
         self._run_id = secrets.randbits(64) or 1
         self._sequence = 0

@@ -11,12 +11,14 @@ import math
 import random
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.bus import Session, endpoints
 from palpate.bus.topics import duty_root
+from palpate.client.streams import is_cancelled
 from palpate.config import check_name
 from palpate.errors import (
     ErrorCode,
@@ -35,6 +37,8 @@ from palpate.messages import (
     SimulationRequest,
     SimulationStep,
 )
+
+P = ParamSpec("P")
 
 OnProgress = Callable[[SimulationProgress], None]
 OnStep = Callable[[int, SimulationStep], None]
@@ -99,7 +103,7 @@ def ask_simulation(
     The answer of a service that is killed, stopped or cut off ends, at the latest after the lease
     of its link (2 s); then another one is asked, and also when one has no room. When none is left,
     the error of the last one is raised; if that one was lost, after two seconds in which the link
-    of another one may come back.
+    of another one may come back. What ``on_progress`` and ``on_step`` raise ends the call.
 
     Raises:
         LinkError: No finite-element service runs.
@@ -114,7 +118,7 @@ def ask_simulation(
     check_name(sensor, "sensor")
     deadline_s = min(request.deadline_s or math.inf, timeout_s)
     end_s = time.monotonic() + deadline_s
-    once = _StepsOnce(on_step)
+    told = _Told(on_step, on_progress)
     asked: set[str] = set()
     error: PalpateError | None = None
     with session.caller_token(request.request_id):
@@ -141,8 +145,10 @@ def ask_simulation(
                 )
             )
             try:
-                return join(once.watch(parts), on_progress=on_progress, on_step=once.take)
+                return join(told.watch(parts), on_progress=told.progress, on_step=told.step)
             except (LinkError, RemoteError, WireError) as failure:
+                if failure is told.callers_error or is_cancelled():
+                    raise
                 if replica is None or not _may_ask_another(failure):
                     raise
                 error = failure
@@ -161,7 +167,7 @@ def _next_replica(session: Session, sensor: str, asked: set[str], patience_s: fl
         left = {one.instance for one in held if one.sensor == sensor} - elsewhere - asked
         if left:
             break
-        if time.monotonic() >= end_s:
+        if time.monotonic() >= end_s or is_cancelled():
             return None
         time.sleep(_POLL_S)
     chosen = random.choice(sorted(left))
@@ -175,11 +181,16 @@ def _may_ask_another(error: PalpateError) -> bool:
     return isinstance(error, LinkError) or getattr(error, "reason", "") == "incomplete"
 
 
-class _StepsOnce:
-    """Tells each step once, although a second service begins again with the first."""
+class _Told:
+    """Tells the caller each step once, although a second service begins again with the first.
 
-    def __init__(self, on_step: OnStep | None) -> None:
+    ``callers_error`` is what a function of the caller has raised; it is not the service's.
+    """
+
+    def __init__(self, on_step: OnStep | None, on_progress: OnProgress | None) -> None:
         self._on_step = on_step
+        self._on_progress = on_progress
+        self.callers_error: Exception | None = None
         self._told: list[NDArray[np.float64]] = []  # their forces [N], each of shape (3,)
         self._mesh = b""
 
@@ -195,13 +206,25 @@ class _StepsOnce:
             self._mesh = part.mesh_sha256 or self._mesh
             yield part
 
-    def take(self, number: int, step: SimulationStep) -> None:
+    def progress(self, progress: SimulationProgress) -> None:
+        """How far the service is that answers now."""
+        if self._on_progress is not None:
+            self._call(self._on_progress, progress)
+
+    def _call(self, function: Callable[P, None], *args: P.args, **named: P.kwargs) -> None:
+        try:
+            function(*args, **named)
+        except Exception as error:
+            self.callers_error = error
+            raise
+
+    def step(self, number: int, step: SimulationStep) -> None:
         """A step of the service that answers now."""
         if self._on_step is None:  # the reply has the steps of one service
             return
         if number == len(self._told):
             self._told.append(step.force)
-            self._on_step(number, step)
+            self._call(self._on_step, number, step)
             return
         apart_n = float(np.linalg.norm(step.force - self._told[number]))
         largest_n = max(float(np.linalg.norm(force)) for force in self._told)

@@ -120,7 +120,7 @@ class Stream(Closing, Generic[M]):
     ) -> None:
         self._client = client
         self._max_age_s = check_duration(max_age_s, "max_age_s", most=math.inf)
-        self._timeout_s = (
+        self.timeout_s = (
             math.inf if timeout_s is None else check_duration(timeout_s, "timeout_s", most=math.inf)
         )
         self._wall_clock_error_s = wall_clock_error_s
@@ -129,6 +129,8 @@ class Stream(Closing, Generic[M]):
         self._same = SameSensor(subscriber.key)
         self._stale = 0
         self._watch: Watch[M] | None = None
+        self.newest: ReceivedMessage[M] | None = None
+        """What was returned last; belongs to the thread that asks for the next."""
 
     @property
     def counters(self) -> dict[str, int]:
@@ -147,7 +149,7 @@ class Stream(Closing, Generic[M]):
             SensorChanged: It is the first of another sensor in the place of the one before.
             LinkError: The client is closed.
         """
-        end_s = time.monotonic() + self._timeout_s
+        end_s = time.monotonic() + self.timeout_s
         stale: StaleError | None = None
         while not self._closed.is_set():
             left_s = end_s - time.monotonic()
@@ -155,7 +157,7 @@ class Stream(Closing, Generic[M]):
                 raise stale or self._silence()
             try:
                 received = self._subscriber.next(min(left_s, TURN_S))
-                self._check_age(received)
+                self.check_age(received)
                 self._same.check(received.message)
             except StreamTimeout:
                 continue
@@ -167,10 +169,16 @@ class Stream(Closing, Generic[M]):
                     break
                 raise
             else:
+                self.newest = received
                 return received.message
         raise StopIteration
 
-    def _check_age(self, received: ReceivedMessage[M]) -> None:
+    def check_age(self, received: ReceivedMessage[M]) -> None:
+        """Check that a message may be used now.
+
+        Raises:
+            StaleError: It is older than ``max_age_s``, or stamped in the future.
+        """
         stamp = self._subscriber.topic.stamp_of(received.message)
         age_s = clock.elapsed_s(received.received_monotonic_ns)
         if stamp is not None:
@@ -179,7 +187,7 @@ class Stream(Closing, Generic[M]):
         if age_s > self._max_age_s:
             name, key = self._subscriber.topic.name, self._subscriber.key
             raise StaleError(
-                f"every {name} on {key} within {self._timeout_s:g} s was too old, the last one "
+                f"every {name} on {key} within {self.timeout_s:g} s was too old, the last one "
                 f"{age_s:.3f} s where {self._max_age_s:g} s is allowed",
                 remedy="do not act on them; check the sensor and its service: palpate status",
             )
@@ -187,7 +195,7 @@ class Stream(Closing, Generic[M]):
     def _silence(self) -> StreamTimeout:
         return StreamTimeout(
             f"no {self._subscriber.topic.name} on {self._subscriber.key} within "
-            f"{self._timeout_s:g} s",
+            f"{self.timeout_s:g} s",
             remedy="check that its publisher runs: palpate status; the stream goes on when it does",
         )
 

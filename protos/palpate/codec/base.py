@@ -90,6 +90,11 @@ def check_serial(serial: str, what: str = "sensor_serial") -> str:
     return serial
 
 
+def check_request_id(request_id: str) -> str:
+    """The id of a request whose caller may hold no token: then it is empty."""
+    return check_serial(request_id, "request_id") if request_id else ""
+
+
 def check_digest(digest: bytes, what: str) -> bytes:
     """A SHA-256: 32 bytes."""
     if len(digest) != 32:

@@ -11,6 +11,7 @@ from palpate.codec.base import (
     Codec,
     check_digest,
     check_field,
+    check_request_id,
     check_serial,
     codec_of,
     delimited,
@@ -131,6 +132,7 @@ def _synthesis_request_from_wire(msg: requests_pb2.SynthesisRequest) -> Synthesi
         _check_sensor(msg.simulator or DEFAULT_SIMULATOR, "simulator"),
         check_positive(msg.deadline_s, "deadline_s"),
         msg.every_step,
+        check_request_id(msg.request_id),
     )
 
 
@@ -146,6 +148,7 @@ def _synthesis_request_encode(request: SynthesisRequest) -> bytes:
         simulator=_check_sensor(request.simulator, "simulator"),
         deadline_s=check_positive(request.deadline_s, "deadline_s"),
         every_step=request.every_step,
+        request_id=check_request_id(request.request_id),
     )
     return head + tail.SerializeToString()
 

@@ -11,6 +11,7 @@ from palpate.codec.base import (
     Codec,
     check_digest,
     check_electrodes,
+    check_request_id,
     check_serial,
     codec_of,
     field_from_wire,
@@ -86,10 +87,15 @@ def sensor_states_to_wire(
                 )
                 for fault in one.faults
             ],
-            message=one.message[:_LINE_MAX],
+            message=_sendable(one.message, _LINE_MAX),
         )
         for one in states
     ]
+
+
+def _sendable(text: str, most: int = _TEXT_MAX) -> str:
+    # Lone surrogates, e.g. of a file name that is no UTF-8, cannot be sent.
+    return text.encode("utf-8", "backslashreplace").decode()[:most]
 
 
 def _check_text(text: str, what: str, *, most: int = _TEXT_MAX) -> str:
@@ -129,7 +135,7 @@ def _zero_from_wire(msg: service_pb2.WrenchZero) -> WrenchZero:
 def _zero_encode(zero: WrenchZero) -> bytes:
     msg = service_pb2.WrenchZero(
         sensor_serial=zero.sensor_serial,
-        device=zero.device[:_LINE_MAX],
+        device=_sendable(zero.device, _LINE_MAX),
         monotonic_ns=_check_time(zero.monotonic_ns),
         wall_ns=_check_time(zero.wall_ns),
         readings_averaged=zero.readings_averaged,
@@ -142,17 +148,13 @@ def _zero_encode(zero: WrenchZero) -> bytes:
     return msg.SerializeToString()
 
 
-def _check_request_id(request_id: str) -> str:
-    return check_serial(request_id, "request_id") if request_id else ""
-
-
 WRENCH_ZERO = codec_of(service_pb2.WrenchZero, _zero_encode, _zero_from_wire)
 WRENCH_ZERO_REQUEST: Codec[WrenchZeroRequest] = codec_of(
     service_pb2.WrenchZeroRequest,
     lambda r: service_pb2.WrenchZeroRequest(
-        readings=r.readings, request_id=_check_request_id(r.request_id)
+        readings=r.readings, request_id=check_request_id(r.request_id)
     ).SerializeToString(),
-    lambda msg: WrenchZeroRequest(msg.readings, _check_request_id(msg.request_id)),
+    lambda msg: WrenchZeroRequest(msg.readings, check_request_id(msg.request_id)),
 )
 
 
@@ -208,8 +210,8 @@ def _error_from_wire(msg: service_pb2.Error) -> ErrorReply:
 def _error_to_wire(error: ErrorReply) -> service_pb2.Error:
     return service_pb2.Error(
         code=int(error.code),  # type: ignore[arg-type]
-        message=error.message[:_TEXT_MAX],
-        remedy=error.remedy[:_TEXT_MAX],
+        message=_sendable(error.message),
+        remedy=_sendable(error.remedy),
         retry_after_ms=max(0, round(error.retry_after_s * 1e3)),
     )
 
@@ -278,7 +280,7 @@ def _status_encode(status: Status) -> bytes:
         counters=dict(status.counters),
         gauges=dict(status.gauges),
         sensors=list(status.sensors),
-        message=status.message[:_TEXT_MAX],
+        message=_sendable(status.message),
         last_error=None if status.last_error is None else _error_to_wire(status.last_error),
         sensor_states=sensor_states_to_wire(status.sensor_states),
         processes=map(_process_to_wire, status.processes),
@@ -317,7 +319,7 @@ def _range_from_wire(msg: service_pb2.TrainingRange) -> TrainingRange:
 
 def _range_to_wire(known: TrainingRange) -> service_pb2.TrainingRange:
     return service_pb2.TrainingRange(
-        source=known.source[:_TEXT_MAX],
+        source=_sendable(known.source),
         data_sha256=known.data_sha256,
         rows=known.rows,
         inputs=map(_value_range_to_wire, known.inputs),
@@ -363,7 +365,7 @@ def _metadata_encode(metadata: ModelMetadata) -> bytes:
         outputs=[_tensor(info) for info in metadata.outputs],
         training_data_sha256=metadata.training_data_sha256,
         metrics=dict(metadata.metrics),
-        trained_on=metadata.trained_on[:_TEXT_MAX],
+        trained_on=_sendable(metadata.trained_on),
         served=served_to_wire(metadata.served),
         training_range=(
             None if metadata.training_range is None else _range_to_wire(metadata.training_range)
@@ -380,10 +382,10 @@ TARE_REQUEST: Codec[TareRequest] = codec_of(
     lambda r: service_pb2.TareRequest(
         tare_id=r.tare_id,
         frames=r.frames,
-        request_id=_check_request_id(r.request_id),
+        request_id=check_request_id(r.request_id),
         anyway=r.anyway,
     ).SerializeToString(),
-    lambda msg: TareRequest(msg.tare_id, msg.frames, _check_request_id(msg.request_id), msg.anyway),
+    lambda msg: TareRequest(msg.tare_id, msg.frames, check_request_id(msg.request_id), msg.anyway),
 )
 SERVICE_REQUEST: Codec[ServiceRequest] = codec_of(
     service_pb2.ServiceRequest, lambda _: b"", lambda _: ServiceRequest()

@@ -66,12 +66,14 @@ class SynthesisRequest:
         simulator: Name under which the finite-element service answers.
         deadline_s: How long the caller waits [s]; 0 = the service's own limit.
         every_step: Each converged step of a simulation gets a reply, not only the last.
+        request_id: Names the token that the caller holds while it waits; empty = it holds none.
     """
 
     source: FieldFrame | ContactDescription | SimulationRequest
     simulator: str = "twin"
     deadline_s: float = 0.0
     every_step: bool = False
+    request_id: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ from palpate.v1 import frames_pb2 as palpate_dot_v1_dot_frames__pb2
 from palpate.v1 import simulation_pb2 as palpate_dot_v1_dot_simulation__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19palpate/v1/requests.proto\x12\npalpate.v1\x1a\x1apalpate/v1/estimates.proto\x1a\x17palpate/v1/frames.proto\x1a\x1bpalpate/v1/simulation.proto\"K\n\x0e\x46\x65\x61tureRequest\x12\x0e\n\x06sensor\x18\x01 \x01(\t\x12)\n\x05\x66rame\x18\x02 \x01(\x0b\x32\x1a.palpate.v1.ElectrodeFrame\"z\n\x12\x43ontactDescription\x12\x10\n\x08indenter\x18\x01 \x01(\t\x12\x10\n\x08location\x18\x02 \x03(\x01\x12\x11\n\tdirection\x18\x03 \x03(\x01\x12\x11\n\x07\x64\x65pth_m\x18\x04 \x01(\x01H\x00\x12\x11\n\x07\x66orce_n\x18\x05 \x01(\x01H\x00\x42\x07\n\x05until\"\xe8\x01\n\x10SynthesisRequest\x12\'\n\x05\x66ield\x18\x01 \x01(\x0b\x32\x16.palpate.v1.FieldFrameH\x00\x12\x31\n\x07\x63ontact\x18\x02 \x01(\x0b\x32\x1e.palpate.v1.ContactDescriptionH\x00\x12\x33\n\nsimulation\x18\x03 \x01(\x0b\x32\x1d.palpate.v1.SimulationRequestH\x00\x12\x11\n\tsimulator\x18\x04 \x01(\t\x12\x12\n\ndeadline_s\x18\x05 \x01(\x01\x12\x12\n\nevery_step\x18\x06 \x01(\x08\x42\x08\n\x06source\"\xd7\x01\n\x0eSynthesisReply\x12/\n\x08\x65stimate\x18\x01 \x01(\x0b\x32\x1d.palpate.v1.SynthesisEstimate\x12(\n\x04step\x18\x02 \x01(\x0b\x32\x1a.palpate.v1.SimulationStep\x12\x13\n\x0bstep_number\x18\x03 \x01(\r\x12.\n\x07outcome\x18\x04 \x01(\x0e\x32\x1d.palpate.v1.SimulationOutcome\x12\x17\n\x0fstopped_because\x18\x05 \x01(\t\x12\x0c\n\x04more\x18\x06 \x01(\x08\"$\n\x0c\x42\x61sisRequest\x12\x14\n\x0c\x62\x61sis_sha256\x18\x01 \x01(\x0c\"\x9a\x01\n\nFieldBasis\x12\x14\n\x0c\x62\x61sis_sha256\x18\x01 \x01(\x0c\x12\x13\n\x0bmesh_sha256\x18\x02 \x01(\x0c\x12\x13\n\x0bmodes_total\x18\x03 \x01(\r\x12\x12\n\nfirst_mode\x18\x04 \x01(\r\x12\r\n\x05nodes\x18\x05 \x01(\r\x12\x0c\n\x04mean\x18\x06 \x03(\x02\x12\r\n\x05modes\x18\x07 \x03(\x02\x12\x0c\n\x04more\x18\x08 \x01(\x08\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19palpate/v1/requests.proto\x12\npalpate.v1\x1a\x1apalpate/v1/estimates.proto\x1a\x17palpate/v1/frames.proto\x1a\x1bpalpate/v1/simulation.proto\"K\n\x0e\x46\x65\x61tureRequest\x12\x0e\n\x06sensor\x18\x01 \x01(\t\x12)\n\x05\x66rame\x18\x02 \x01(\x0b\x32\x1a.palpate.v1.ElectrodeFrame\"z\n\x12\x43ontactDescription\x12\x10\n\x08indenter\x18\x01 \x01(\t\x12\x10\n\x08location\x18\x02 \x03(\x01\x12\x11\n\tdirection\x18\x03 \x03(\x01\x12\x11\n\x07\x64\x65pth_m\x18\x04 \x01(\x01H\x00\x12\x11\n\x07\x66orce_n\x18\x05 \x01(\x01H\x00\x42\x07\n\x05until\"\xfc\x01\n\x10SynthesisRequest\x12\'\n\x05\x66ield\x18\x01 \x01(\x0b\x32\x16.palpate.v1.FieldFrameH\x00\x12\x31\n\x07\x63ontact\x18\x02 \x01(\x0b\x32\x1e.palpate.v1.ContactDescriptionH\x00\x12\x33\n\nsimulation\x18\x03 \x01(\x0b\x32\x1d.palpate.v1.SimulationRequestH\x00\x12\x11\n\tsimulator\x18\x04 \x01(\t\x12\x12\n\ndeadline_s\x18\x05 \x01(\x01\x12\x12\n\nevery_step\x18\x06 \x01(\x08\x12\x12\n\nrequest_id\x18\x07 \x01(\tB\x08\n\x06source\"\xd7\x01\n\x0eSynthesisReply\x12/\n\x08\x65stimate\x18\x01 \x01(\x0b\x32\x1d.palpate.v1.SynthesisEstimate\x12(\n\x04step\x18\x02 \x01(\x0b\x32\x1a.palpate.v1.SimulationStep\x12\x13\n\x0bstep_number\x18\x03 \x01(\r\x12.\n\x07outcome\x18\x04 \x01(\x0e\x32\x1d.palpate.v1.SimulationOutcome\x12\x17\n\x0fstopped_because\x18\x05 \x01(\t\x12\x0c\n\x04more\x18\x06 \x01(\x08\"$\n\x0c\x42\x61sisRequest\x12\x14\n\x0c\x62\x61sis_sha256\x18\x01 \x01(\x0c\"\x9a\x01\n\nFieldBasis\x12\x14\n\x0c\x62\x61sis_sha256\x18\x01 \x01(\x0c\x12\x13\n\x0bmesh_sha256\x18\x02 \x01(\x0c\x12\x13\n\x0bmodes_total\x18\x03 \x01(\r\x12\x12\n\nfirst_mode\x18\x04 \x01(\r\x12\r\n\x05nodes\x18\x05 \x01(\r\x12\x0c\n\x04mean\x18\x06 \x03(\x02\x12\r\n\x05modes\x18\x07 \x03(\x02\x12\x0c\n\x04more\x18\x08 \x01(\x08\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -39,11 +39,11 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_CONTACTDESCRIPTION']._serialized_start=200
   _globals['_CONTACTDESCRIPTION']._serialized_end=322
   _globals['_SYNTHESISREQUEST']._serialized_start=325
-  _globals['_SYNTHESISREQUEST']._serialized_end=557
-  _globals['_SYNTHESISREPLY']._serialized_start=560
-  _globals['_SYNTHESISREPLY']._serialized_end=775
-  _globals['_BASISREQUEST']._serialized_start=777
-  _globals['_BASISREQUEST']._serialized_end=813
-  _globals['_FIELDBASIS']._serialized_start=816
-  _globals['_FIELDBASIS']._serialized_end=970
+  _globals['_SYNTHESISREQUEST']._serialized_end=577
+  _globals['_SYNTHESISREPLY']._serialized_start=580
+  _globals['_SYNTHESISREPLY']._serialized_end=795
+  _globals['_BASISREQUEST']._serialized_start=797
+  _globals['_BASISREQUEST']._serialized_end=833
+  _globals['_FIELDBASIS']._serialized_start=836
+  _globals['_FIELDBASIS']._serialized_end=990
 # @@protoc_insertion_point(module_scope)

@@ -32,20 +32,22 @@ class ContactDescription(_message.Message):
     def __init__(self, indenter: _Optional[str] = ..., location: _Optional[_Iterable[float]] = ..., direction: _Optional[_Iterable[float]] = ..., depth_m: _Optional[float] = ..., force_n: _Optional[float] = ...) -> None: ...
 
 class SynthesisRequest(_message.Message):
-    __slots__ = ("field", "contact", "simulation", "simulator", "deadline_s", "every_step")
+    __slots__ = ("field", "contact", "simulation", "simulator", "deadline_s", "every_step", "request_id")
     FIELD_FIELD_NUMBER: _ClassVar[int]
     CONTACT_FIELD_NUMBER: _ClassVar[int]
     SIMULATION_FIELD_NUMBER: _ClassVar[int]
     SIMULATOR_FIELD_NUMBER: _ClassVar[int]
     DEADLINE_S_FIELD_NUMBER: _ClassVar[int]
     EVERY_STEP_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     field: _frames_pb2.FieldFrame
     contact: ContactDescription
     simulation: _simulation_pb2.SimulationRequest
     simulator: str
     deadline_s: float
     every_step: bool
-    def __init__(self, field: _Optional[_Union[_frames_pb2.FieldFrame, _Mapping]] = ..., contact: _Optional[_Union[ContactDescription, _Mapping]] = ..., simulation: _Optional[_Union[_simulation_pb2.SimulationRequest, _Mapping]] = ..., simulator: _Optional[str] = ..., deadline_s: _Optional[float] = ..., every_step: _Optional[bool] = ...) -> None: ...
+    request_id: str
+    def __init__(self, field: _Optional[_Union[_frames_pb2.FieldFrame, _Mapping]] = ..., contact: _Optional[_Union[ContactDescription, _Mapping]] = ..., simulation: _Optional[_Union[_simulation_pb2.SimulationRequest, _Mapping]] = ..., simulator: _Optional[str] = ..., deadline_s: _Optional[float] = ..., every_step: _Optional[bool] = ..., request_id: _Optional[str] = ...) -> None: ...
 
 class SynthesisReply(_message.Message):
     __slots__ = ("estimate", "step", "step_number", "outcome", "stopped_because", "more")

@@ -240,9 +240,11 @@ def _synthesis(
         service="synthesis",
         instance=health.instance,
     )
+    requests = SynthesisRequests(session, config, models, health)
+    session.watch_callers(requests.caller_gone)
     session.stream_queryable(
         endpoints.SYNTHESISE_FROM,
-        SynthesisRequests(session, config, models, health).handle,
+        requests.handle,
         service="synthesis",
         instance=health.instance,
         workers=config.simulations,

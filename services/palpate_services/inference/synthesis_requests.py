@@ -8,6 +8,7 @@ contact that has reached its force, end the simulation: its token on the bus van
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 import uuid
 from collections.abc import Generator, Iterator
@@ -17,7 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from palpate import clock
-from palpate.bus import QueryAnswer, Session, endpoints
+from palpate.bus import Cancellation, QueryAnswer, Session, endpoints
+from palpate.bus.presence import GoneCallers
+from palpate.bus.topics import caller_key
 from palpate.client.simulations import GRACE_S
 from palpate.errors import ErrorCode, LinkError, RemoteError
 from palpate.files.bundle import FieldMesh
@@ -152,6 +155,41 @@ class SynthesisRequests:
         self._config = config
         self._models = models
         self._health = health
+        self._lock = threading.Lock()
+        self._gone = GoneCallers()
+        # The simulations that run: which token their caller holds, when it asked [s, monotonic].
+        self._running: dict[Cancellation, tuple[str, float]] = {}
+
+    def caller_gone(self, key: str, when_s: float) -> None:
+        """Stop the simulations of a caller that has left; see ``Session.watch_callers``."""
+        self._gone.add(key, when_s)
+        with self._lock:
+            left = [
+                one
+                for one, (held, asked_s) in self._running.items()
+                if held == key and asked_s <= when_s
+            ]
+        for one in left:
+            self._health.count("callers_gone")
+            one.cancel()
+
+    @contextlib.contextmanager
+    def _while_waiting(self, request_id: str, asked_s: float) -> Iterator[None]:
+        """Within, the questions are cancelled once the caller of this id has left."""
+        if not request_id:
+            yield
+            return
+        key, cancellation = caller_key(self._session.station, request_id), Cancellation()
+        with self._lock:
+            self._running[cancellation] = key, asked_s
+        try:
+            if (gone_s := self._gone.since(key)) is not None:  # while the question waited
+                self.caller_gone(key, gone_s)
+            with cancellation:
+                yield
+        finally:
+            with self._lock:
+                del self._running[cancellation]
 
     def handle(self, request: SynthesisRequest, answer: QueryAnswer[SynthesisReply]) -> None:
         """Answer a question, or raise the ``PalpateError`` that says why not."""
@@ -163,7 +201,8 @@ class SynthesisRequests:
             answer.send(SynthesisReply(estimate))
         else:
             self._health.count("asked")
-            self._simulate(request, runtime, answer)
+            with self._while_waiting(request.request_id, 1e-9 * answer.arrived_ns):
+                self._simulate(request, runtime, answer)
         answer.end()
 
     def _simulate(
