@@ -68,7 +68,7 @@ PRESS_KINDS = ("normal", "angled", "path", "random")
 def press_kind(trajectory: str) -> str:
     """Kind of a trajectory by its id, one of ``PRESS_KINDS``; empty where the id does not tell it.
 
-    Those of published files do not: they are ``<indenter>/<number>``.
+    Those of the paper's files do not: they are ``<indenter>/<number>``.
     """
     kind = trajectory.rpartition("/")[2].partition("-")[0]
     return kind if kind in PRESS_KINDS else ""
