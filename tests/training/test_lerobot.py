@@ -77,6 +77,23 @@ def test_times_in_whole_milliseconds_are_one_episode(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fps", [None, 100.0])
+def test_rows_of_two_fingers_between_one_another_are_two_episodes(
+    tmp_path: Path, fps: float | None
+) -> None:
+    apart = rows_at(100.0, 100.0)
+    order = np.argsort(apart.time_ns, kind="stable")
+    between = replace(apart, **{name: array[order] for name, array in apart.arrays().items()})
+    assert list(between.sensor[:4]) == [0, 1, 0, 1]
+    assert export_lerobot(tmp_path / "set", between, fps=fps) == 2
+    written = read_lerobot(tmp_path / "set")
+    for name in ("time_ns", "group"):
+        np.testing.assert_array_equal(written.column(name), getattr(apart, name))
+    np.testing.assert_array_equal(
+        written.column("observation.force").to_pylist(), apart.force.tolist()
+    )
+
+
+@pytest.mark.parametrize("fps", [None, 100.0])
 @pytest.mark.parametrize("row", [0, 1], ids=["of the first", "of the last"])
 def test_rows_that_share_a_time_are_one_episode(
     tmp_path: Path, row: int, fps: float | None
