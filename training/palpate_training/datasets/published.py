@@ -32,7 +32,7 @@ from palpate.process import require
 from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.container import Provenance, read_provenance
 from palpate_training.datasets.experiment import ExperimentDataset
-from palpate_training.datasets.features import ELECTRODES
+from palpate_training.datasets.features import ELECTRODES, LOCATION_MOST_M
 from palpate_training.datasets.processing import THRESHOLD_N
 from palpate_training.datasets.trials import TrialHeader, TrialRows
 
@@ -55,7 +55,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 LARGEST_FORCE_N = 100.0
 """The paper's largest is 32.1 N."""
 
-LARGEST_M = (0.004, 0.1)
+LARGEST_M = (0.004, LOCATION_MOST_M)
 """Between these lies the largest coordinate of a contact on a fingertip 28 mm long [m]."""
 
 
