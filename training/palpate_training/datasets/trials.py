@@ -280,10 +280,10 @@ def _contents(path: Path, file: h5py.File) -> TrialsContents:
         if name not in file.attrs:
             raise DatasetError(f"{path}: attribute {name} is missing", remedy=_AGAIN)
     count = int(file.attrs["trial_count"])
-    held = sorted(file[GROUP]) if GROUP in file else []
+    held = set(file[GROUP]) if GROUP in file else set()
     expected = [_name(number).removeprefix(f"{GROUP}/") for number in range(count)]
-    if held != expected:
-        absent = sorted(set(expected) - set(held))
+    if held != set(expected):
+        absent = sorted(set(expected) - held)
         what = f"group {GROUP}/{absent[0]} is missing" if absent else f"has {len(held)} groups"
         raise DatasetError(f"{path}: {what}; the file says {count} trials", remedy=_AGAIN)
     seen: set[tuple[str, str]] = set()
