@@ -12,8 +12,10 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from palpate.errors import DatasetError
+from palpate_training.cli import data_app, train_app
 from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.container import Provenance
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
@@ -186,16 +188,16 @@ def test_millimetres_and_metres_are_told_apart(folder: Path, source: ExperimentD
     assert "mm" in read.provenance.notes
 
 
+def _turn(file: Any) -> None:
+    """Make y dorsal, as in the public mesh: (x, z, -y) of the sensor frame; and turn the force."""
+    for group, sign in (("contact_loc", 1.0), ("force_vec", -1.0)):
+        x, y, z = file[group]["data"][()].T
+        file[group]["data"][...] = sign * np.stack([x, z, -y], axis=1)
+
+
 def test_other_axes_and_the_force_on_the_indenter(folder: Path, source: ExperimentDataset) -> None:
-    """A file whose y is dorsal, as in the public mesh: (x, z, -y) of the sensor frame."""
-
-    def turn(file: Any) -> None:
-        for group, sign in (("contact_loc", 1.0), ("force_vec", -1.0)):
-            x, y, z = file[group]["data"][()].T
-            file[group]["data"][...] = sign * np.stack([x, z, -y], axis=1)
-
     for unit in (1, 2, 3):
-        _edit(folder, turn, unit)
+        _edit(folder, _turn, unit)
     with pytest.raises(DatasetError, match="the pad looks to -z"):
         read_published(folder)
     with pytest.raises(DatasetError, match="the pad looks to -z"):
@@ -204,6 +206,34 @@ def test_other_axes_and_the_force_on_the_indenter(folder: Path, source: Experime
     for name in ("location", "force"):
         found, expected = getattr(read, name), getattr(source, name)
         np.testing.assert_array_equal(np.sort(found, axis=0), np.sort(expected, axis=0))
+
+
+def test_every_command_takes_files_in_other_axes_and_of_the_units_that_are_there(
+    make_rows: Callable[..., TrialRows], provenance: Provenance, tmp_path: Path
+) -> None:
+    trials = [
+        make_rows(unit, f"cube/{point}/n") for unit in ("unit-2", "unit-3") for point in range(10)
+    ]
+    source = assemble_experiment(trials, provenance)
+    folder, out = tmp_path / "published", tmp_path / "out"
+    export_published(folder, source)
+    for unit in (2, 3):
+        _edit(folder, _turn, unit)
+    report = ("report", "--data", folder, "--out", out, "--splits", "trajectory", "--so-far")
+    for app, words, then in (
+        (data_app, ("export", folder, out / "exported", "--published"), "None"),
+        # Past reading: nothing is trained without the rest, nor to show what is finished.
+        (train_app, ("all", folder, out / "models"), "rest of biotac-2 cube/0/n is not known"),
+        (train_app, report, "no finished training"),
+    ):
+        arguments = [*map(str, words)]
+        refused = CliRunner().invoke(app, arguments)
+        assert "give --axes, and --force-on-indenter" in str(refused.exception)
+        told = CliRunner().invoke(app, [*arguments, "--axes", "x,-z,y", "--force-on-indenter"])
+        assert then in str(told.exception)
+    exported = read_published(out / "exported")
+    assert exported.unit_names == ("biotac-2", "biotac-3")
+    np.testing.assert_array_equal(np.sort(exported.force, axis=0), np.sort(source.force, axis=0))
 
 
 @pytest.mark.parametrize(

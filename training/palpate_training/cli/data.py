@@ -196,6 +196,8 @@ def data_export(
         float | None,
         typer.Option(min=1e-3, help="--lerobot: rows a second; none = what their times say."),
     ] = None,
+    axes: AxesOption = "x,y,z",
+    force_on_indenter: ForceOption = False,
 ) -> None:
     """Data set -> files for others.
 
@@ -217,7 +219,7 @@ def data_export(
             "palpate data features",
         )
     if not rows:
-        _, experiment = load(path)
+        _, experiment = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
         if csv:
             console.print(f"wrote {out}: {export_csv(out, experiment)} rows")
         else:
