@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -81,8 +82,10 @@ def test_rows_of_two_fingers_between_one_another_are_two_episodes(
     tmp_path: Path, fps: float | None
 ) -> None:
     apart = rows_at(100.0, 100.0)
+    assert apart.time_ns is not None
     order = np.argsort(apart.time_ns, kind="stable")
-    between = replace(apart, **{name: array[order] for name, array in apart.arrays().items()})
+    columns: dict[str, Any] = {name: array[order] for name, array in apart.arrays().items()}
+    between = replace(apart, **columns)
     assert list(between.sensor[:4]) == [0, 1, 0, 1]
     assert export_lerobot(tmp_path / "set", between, fps=fps) == 2
     written = read_lerobot(tmp_path / "set")

@@ -121,8 +121,9 @@ def test_an_export_states_its_trajectories(source: ExperimentDataset, tmp_path: 
     """
     rows = np.flatnonzero(np.append(True, source.trial[1:] != source.trial[:-1]))
     rows = np.sort(np.concatenate([rows, rows + 4]))
-    moved = source.location + np.float32([2e-3, 0, 0]) * (source.row_unit == 1)[:, None]
-    moved -= np.float32([2e-3, 0, 0]) * (source.row_unit == 0)[:, None]
+    moved = source.location.copy()
+    moved[source.row_unit == 0, 0] -= np.float32(2e-3)
+    moved[source.row_unit == 1, 0] += np.float32(2e-3)
     spread = replace(
         source,
         location=moved[rows],

@@ -151,7 +151,8 @@ def _recordings_apart(data: FeatureDataset) -> FeatureDataset:
     if 1 + np.count_nonzero(np.diff(recording)) == len(np.unique(recording)):
         return data
     order = np.lexsort((np.arange(len(data)), data.group, data.sensor))
-    return replace(data, **{name: array[order] for name, array in data.arrays().items()})
+    columns: dict[str, Any] = {name: array[order] for name, array in data.arrays().items()}
+    return replace(data, **columns)
 
 
 def _rate(data: FeatureDataset, fps: float | None) -> float:
