@@ -205,6 +205,7 @@ def test_record_aligns_and_numbers_presses(record: Record) -> None:
     np.testing.assert_array_equal(data.in_contact, touches)
     assert np.isnan(data.contact_location[~data.in_contact]).all()
     np.testing.assert_allclose(data.contact_location[30], [0.031, 0, -0.008], atol=1e-6)
+    assert "left out" not in data.provenance.notes
     np.testing.assert_array_equal(np.unique(data.group), [0, 1])
     assert data.group[49] == 0
     assert data.group[50] == 1
@@ -241,7 +242,9 @@ def test_a_finger_without_poses_takes_no_location_in_silence(record: Record) -> 
     assert "no contact locations, because thumb has no pose" in data.provenance.notes
 
 
-def test_record_drops_what_cannot_be_used(record: Record) -> None:
+def test_record_drops_what_cannot_be_used_and_tells(
+    record: Record, caplog: pytest.LogCaptureFixture
+) -> None:
     record.add(TARE, tare(1, 2000.0), tare(2, 1990.0))
     record.add(ELECTRODES, frame(6, tare_id=0))  # before any tare
     record.add(ELECTRODES, replace(frame(1), validity=1))  # bad channels
@@ -253,6 +256,12 @@ def test_record_drops_what_cannot_be_used(record: Record) -> None:
     np.testing.assert_array_equal(data.tared_counts[:, 0], [2, 13])
     assert data.contact_location is None
     assert data.in_contact is not None, "without poses, contact is a force above a threshold"
+    told = (
+        "4 of 6 frames of finger left out: 3 not valid or with no tare in the record, 1 with no"
+        " force within three periods"
+    )
+    assert told in data.provenance.notes
+    assert told in caplog.text
 
 
 def test_no_frame_of_a_biotac_sp_is_left_out_in_silence(record: Record) -> None:
@@ -433,6 +442,7 @@ def test_what_an_overloaded_sensor_says_is_no_truth(
     told = "50 rows of finger left out: the force/torque sensor was overloaded"
     assert told in data.provenance.notes
     assert "50 of 100 frames of finger are left out: the force/torque sensor was" in caplog.text
+    assert "within three periods" not in caplog.text, "each frame is told once"
 
 
 def test_between_a_good_reading_and_an_overloaded_one_the_force_is_unknown(record: Record) -> None:

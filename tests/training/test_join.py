@@ -127,6 +127,12 @@ def test_joined_features_keep_presses_apart(press_data: Callable[..., FeatureDat
     assert both.sensor_names == ("finger", "second")
     np.testing.assert_array_equal(both.sensor, np.repeat([0, 1], [60, 40]))
     np.testing.assert_array_equal(both.electrodes[60:], other.electrodes)
+    with_notes = [
+        replace(part, provenance=replace(part.provenance, notes=note))
+        for part, note in ((one, "axes x,-z,y"), (other, "rest assumed"))
+    ]
+    said = joined(with_notes).provenance.notes
+    assert said.endswith("; of parts: axes x,-z,y; of parts: rest assumed")
     same = joined([one, press_data(2, 20, 2)])
     assert same.sensor_names == ("finger",)
     with pytest.raises(DatasetError, match="does not say contact_location"):
@@ -184,6 +190,41 @@ def test_one_plan_on_two_specimens_is_held_out_together(
     assert done.exit_code == 0, done.output
     both, alone = open_dataset(tmp_path / "rows.h5"), features(large).group
     np.testing.assert_array_equal(both.group, np.concatenate([alone, alone]))
+
+
+def test_one_plan_is_known_again_after_a_part_was_joined(
+    large: MixedDataset, tmp_path: Path
+) -> None:
+    """Its trajectories are called after the part then; those of the other part are others."""
+    move = np.array([0.0, 0.02, 0.0], np.float32)
+
+    def pressed(unit: str, gain: float, by_m: np.ndarray) -> MixedDataset:
+        own = large.experiment
+        rows = replace(
+            own,
+            unit_names=tuple(f"{unit}-{name}" for name in own.unit_names),
+            tared=own.tared * np.float32(gain),
+            location=own.location + by_m,
+        )
+        return replace(large, experiment=rows)
+
+    one, elsewhere, again = (
+        pressed("one", 1.0, 0.0 * move),
+        pressed("elsewhere", 1.1, move),
+        pressed("again", 1.2, 0.05 * move),
+    )
+    both = join_mixed([elsewhere, one], ["elsewhere", "one"], modes=2, force_modes=2)
+    files = [tmp_path / "both.h5", tmp_path / "again.h5"]
+    for file, data in zip(files, (both, again), strict=True):
+        write_mixed(file, data)
+    with pytest.raises(DatasetError, match="the same trajectories, pressed on different specimens"):
+        join_files(files, tmp_path / "all.h5", modes=2, force_modes=2, command="")
+    done = CliRunner().invoke(data_app, ["features", *map(str, files), str(tmp_path / "rows.h5")])
+    assert done.exit_code == 0, done.output
+    group, rows = open_dataset(tmp_path / "rows.h5").group, len(features(large))
+    of_elsewhere, of_one, of_again = (group[k * rows : (k + 1) * rows] for k in range(3))
+    np.testing.assert_array_equal(of_one, of_again)
+    assert not set(of_elsewhere) & set(of_one)
 
 
 def test_a_part_and_what_it_is_of_are_not_joined(large: MixedDataset, tmp_path: Path) -> None:

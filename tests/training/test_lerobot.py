@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,6 +75,25 @@ def test_times_in_whole_milliseconds_are_one_episode(tmp_path: Path) -> None:
     rounded = replace(data, time_ns=data.time_ns // 1_000_000 * 1_000_000)
     assert export_lerobot(tmp_path / "set", rounded) == 1
     assert largest_error_s(tmp_path / "set") < 0.002
+
+
+@pytest.mark.parametrize("fps", [None, 100.0])
+def test_rows_of_two_fingers_between_one_another_are_two_episodes(
+    tmp_path: Path, fps: float | None
+) -> None:
+    apart = rows_at(100.0, 100.0)
+    assert apart.time_ns is not None
+    order = np.argsort(apart.time_ns, kind="stable")
+    columns: dict[str, Any] = {name: array[order] for name, array in apart.arrays().items()}
+    between = replace(apart, **columns)
+    assert list(between.sensor[:4]) == [0, 1, 0, 1]
+    assert export_lerobot(tmp_path / "set", between, fps=fps) == 2
+    written = read_lerobot(tmp_path / "set")
+    for name in ("time_ns", "group"):
+        np.testing.assert_array_equal(written.column(name), getattr(apart, name))
+    np.testing.assert_array_equal(
+        written.column("observation.force").to_pylist(), apart.force.tolist()
+    )
 
 
 @pytest.mark.parametrize("fps", [None, 100.0])

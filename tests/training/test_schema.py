@@ -13,6 +13,7 @@ import pytest
 
 from palpate.errors import DatasetError
 from palpate_training.datasets.features import (
+    SENSORS_MOST,
     FeatureDataset,
     check_learnable,
     open_dataset,
@@ -132,6 +133,15 @@ def test_a_broken_file_is_named(path: Path, change: Callable[[Any], None], words
         open_dataset(path)
     assert str(path) in str(caught.value)
     assert caught.value.remedy
+
+
+def test_more_sensors_than_a_file_holds_are_refused(data: FeatureDataset, tmp_path: Path) -> None:
+    names = tuple(f"finger-{number}" for number in range(SENSORS_MOST + 1))
+    write_dataset(tmp_path / "most.h5", replace(data, sensor_names=names[:-1]))
+    assert open_dataset(tmp_path / "most.h5").sensor_names == names[:-1]
+    with pytest.raises(DatasetError, match="4001 sensors are more than a file holds: 4000"):
+        write_dataset(tmp_path / "more.h5", replace(data, sensor_names=names))
+    assert not (tmp_path / "more.h5").exists()
 
 
 def test_nothing_is_learned_from_forces_in_mn(data: FeatureDataset) -> None:

@@ -336,6 +336,31 @@ def test_errors_count_rows_of_the_table(data: FeatureDataset) -> None:
         dataset_of(table, columns, source=Path("x"), drop_incomplete=True)
 
 
+def test_a_minus_turns_all_numbers_of_a_list(data: FeatureDataset) -> None:
+    table = table_of(data).append_column("push", pa.array(data.force.tolist()))
+    rest = columns_of("baseline")
+    columns = ColumnMap(electrodes=columns_of("electrodes"), rest=rest, force="-push")
+    found = dataset_of(table, columns, source=Path("x"))
+    np.testing.assert_array_equal(found.force, -data.force)
+    with pytest.raises(DatasetError, match=r"no column 'pull'"):
+        dataset_of(table, columns.model_copy(update={"force": "-pull"}), source=Path("x"))
+
+
+@pytest.mark.parametrize("name", ["contact_location", "centre_of_pressure"])
+def test_locations_in_mm_are_not_taken_for_metres(data: FeatureDataset, name: str) -> None:
+    place = pa.array([[12.0, 1.0, -7.0]] * len(data))
+    told = {name: columns_of(name) for name in ("electrodes", "force")}
+    columns = ColumnMap.model_validate(
+        {**told, name: "place", "in_contact": "in_contact", "rest": columns_of("baseline")}
+    )
+    table = table_of(data).append_column("place", place)
+    with pytest.raises(DatasetError, match=f"half of {name} is 13.93 m .* length_unit"):
+        dataset_of(table, columns, source=Path("x"))
+    in_mm = columns.model_copy(update={"length_unit": "mm"})
+    found = getattr(dataset_of(table, in_mm, source=Path("x")), name)
+    np.testing.assert_allclose(found[0], [0.012, 0.001, -0.007], rtol=1e-6)
+
+
 def test_lists_of_another_width_are_refused(data: FeatureDataset) -> None:
     skin = [row.tolist() for row in data.electrodes]
     skin[3] = skin[3][:-1]

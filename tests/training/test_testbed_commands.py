@@ -177,7 +177,8 @@ def test_ingest_takes_starts_of_trajectories(
     second = plan.motions[1]
     at = START_NS + round(second.start_s * 1e9)
     words = ("ingest", record, plan_file, out, "--unit", "u", "--sensor", "finger")
-    times.write_text(f"trajectory,start_wall_ns\ns/01/normal,{at}\n")
+    # With the byte order mark that spreadsheets write.
+    times.write_text(f"trajectory,start_wall_ns\ns/01/normal,{at}\n", encoding="utf-8-sig")
     assert _run(*words, "--starts", times).exit_code == 0
     assert [header.trajectory for header in read_contents(out).headers] == ["s/01/normal"]
     for text, match in (

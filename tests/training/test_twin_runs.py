@@ -91,8 +91,26 @@ def test_a_third_unit_meets_what_the_second_brought() -> None:
     assert names == [["a/000"], ["a/001"], ["a/001", "a/000", "a/002"]]
 
 
-def test_a_path_too_short_for_a_direction_is_not_matched() -> None:
-    tip = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-4]])
+def _short(x_mm: float) -> PublishedRun:
+    tip = np.array([[x_mm * 1e-3, 0.0, 0.0], [x_mm * 1e-3, 0.0, 1e-4]])
     force = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.6]])
     (short,) = find_runs("file", force, tip, np.array(["a", "a"], dtype=object))
-    assert name_trajectories([[short], [short]]) == [["a/000"], ["a/001"]]
+    return short
+
+
+def test_a_path_too_short_for_a_direction_is_matched_by_its_place() -> None:
+    assert name_trajectories([[_short(0)], [_run(0.2, 40)]]) == [["a/000"], ["a/000"]]
+    assert name_trajectories([[_run(0.2, 40)], [_short(0)]]) == [["a/000"], ["a/000"]]
+    assert name_trajectories([[_short(0)], [_short(2)]]) == [["a/000"], ["a/001"]]
+
+
+def test_a_path_with_the_same_direction_is_preferred_to_a_short_one() -> None:
+    assert name_trajectories([[_short(0), _run(0, 40)], [_run(0, 40)]])[1] == ["a/001"]
+
+
+@pytest.mark.parametrize(("angle_deg", "same"), [(14, True), (16, False)])
+def test_paths_of_one_trajectory_differ_by_half_of_what_plans_do(
+    angle_deg: float, same: bool
+) -> None:
+    (first,), (second,) = name_trajectories([[_run(0)], [_run(0, angle_deg)]])
+    assert (first == second) == same

@@ -196,6 +196,8 @@ def data_export(
         float | None,
         typer.Option(min=1e-3, help="--lerobot: rows a second; none = what their times say."),
     ] = None,
+    axes: AxesOption = "x,y,z",
+    force_on_indenter: ForceOption = False,
 ) -> None:
     """Data set -> files for others.
 
@@ -217,7 +219,7 @@ def data_export(
             "palpate data features",
         )
     if not rows:
-        _, experiment = load(path)
+        _, experiment = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
         if csv:
             console.print(f"wrote {out}: {export_csv(out, experiment)} rows")
         else:
@@ -260,9 +262,12 @@ def data_features(
         _, data = load(path, axes=axes.split(","), force_on_indenter=force_on_indenter)
         experiment = data.experiment if isinstance(data, MixedDataset) else data
         # A plan may have been pressed on specimens whose files are apart.
-        plans.append(press_starts(experiment))
-        plan = next(n for n, other in enumerate(plans) if pressed_alike(plans[-1], other))
-        groups.append([f"{plan}/{name}" for name in experiment.trajectories])
+        called: dict[str, str] = {}
+        for joined_as, starts in press_starts(experiment).items():
+            plans.append(starts)
+            plan = next(n for n, other in enumerate(plans) if pressed_alike(starts, other))
+            called |= {f"{joined_as}{name}": f"{plan}/{name}" for name in starts}
+        groups.append([called.get(name, name) for name in experiment.trajectories])
         part = features(data, untouched_rows=untouched_rows, assumed_rest=assumed_rest)
         # Published files do not say what made them, so these rows begin here.
         made_by = part.provenance.command or typed_command()

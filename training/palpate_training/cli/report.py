@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,6 +26,7 @@ from rich.table import Table
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.atomic import written_whole
 from palpate.process import told_in_log, typed_command
+from palpate_training.cli.data import AxesOption, ForceOption
 
 if TYPE_CHECKING:
     from palpate_training.evaluation.cells import Cell
@@ -80,6 +82,8 @@ def train_report(
     so_far: Annotated[
         bool, typer.Option("--so-far", help="Train nothing; show what is finished.")
     ] = False,
+    axes: AxesOption = "x,y,z",
+    force_on_indenter: ForceOption = False,
 ) -> None:
     """Train and test every system on every split; goes on where a run was killed.
 
@@ -116,7 +120,8 @@ def train_report(
         seeds=tuple(range(seeds)),
         whole=whole,
     )
-    study = Study(read_source(data, test_part), plan)
+    source = read_source(data, test_part, axes=axes.split(","), force_on_indenter=force_on_indenter)
+    study = Study(source, plan)
     folder = cells or out / "cells"
     if not so_far:
         make_with_progress(study, folder, workers or os.cpu_count() or 1, device)
@@ -239,19 +244,27 @@ def make_with_progress(study: Study, folder: Path, workers: int, device: str) ->
         study.make(folder, workers=workers, device=device, on_cell=on_cell)
 
 
-def read_source(path: Path, part: str = "") -> StudySource:
+def read_source(
+    path: Path,
+    part: str = "",
+    *,
+    axes: Sequence[str] = ("x", "y", "z"),
+    force_on_indenter: bool = False,
+) -> StudySource:
     """Data of a study: an experiment, generated, executed or published; or real recordings.
 
     Args:
         path: Folder of the data, or a mixed data set.
         part: Of a joined data set, whose rows alone are tested.
+        axes: Of published files, as in ``read_published``.
+        force_on_indenter: Likewise.
 
     Raises:
         ConfigError: Recordings, which have no parts.
         DatasetError: There is none, or it is damaged.
     """
     from palpate_training.datasets.experiment import read_experiment, read_mixed
-    from palpate_training.datasets.published import published_file, read_published
+    from palpate_training.datasets.published import published_units, read_published
     from palpate_training.evaluation.experiments import ExperimentSource
     from palpate_training.evaluation.recordings import read_recordings
 
@@ -265,8 +278,11 @@ def read_source(path: Path, part: str = "") -> StudySource:
             read_mixed(mixed) if mixed.is_file() else None,
             part,
         )
-    if any(published_file(path, unit).is_file() for unit in (1, 2, 3)):
-        return ExperimentSource(read_published(path, command=typed_command()), None, part)
+    if published_units(path):
+        published = read_published(
+            path, axes=axes, force_on_indenter=force_on_indenter, command=typed_command()
+        )
+        return ExperimentSource(published, None, part)
     recordings = read_recordings(path)
     if recordings is None:
         raise DatasetError(

@@ -19,6 +19,7 @@ from palpate.files.atomic import written_whole
 from palpate.files.bundle import read_bundle, read_manifest
 from palpate.files.card import model_card
 from palpate.process import told_in_log, typed_command
+from palpate_training.cli.data import AxesOption, ForceOption
 from palpate_training.datasets.features import open_dataset
 
 Mixed = Annotated[Path, typer.Argument(help="Mixed data set (.h5).")]
@@ -155,6 +156,8 @@ def train_all(
     serials: Serials = None,
     device: Device = "auto",
     batch_rows: BatchRows = BATCH_ROWS,
+    axes: AxesOption = "x,y,z",
+    force_on_indenter: ForceOption = False,
 ) -> None:
     """Bundles of all tasks from one data set: features, field, synthesis, and their model cards.
 
@@ -167,7 +170,7 @@ def train_all(
     from palpate_training.learning.export import refuse_existing
     from palpate_training.learning.splits import by_trajectory, of_units
 
-    _, experiment = load(data)
+    _, experiment = load(data, axes=axes.split(","), force_on_indenter=force_on_indenter)
     tasks = (
         ("features", "field", "synthesis")
         if isinstance(experiment, MixedDataset)

@@ -59,14 +59,15 @@ class Provenance:
 
 
 def joined_provenance(
-    parts: Sequence[Provenance], contents: Sequence[str], command: str
+    parts: Sequence[Provenance], contents: Sequence[str], command: str, note: str = ""
 ) -> Provenance:
-    """Where a data set comes from that is put together of several.
+    """Where a data set comes from that is put together of several; it keeps their notes.
 
     Args:
         parts: Where each of them comes from.
         contents: Digest of the content of each.
         command: The command that joins them.
+        note: What else is to be said of joining them.
 
     Raises:
         DatasetError: Their licences differ.
@@ -77,13 +78,17 @@ def joined_provenance(
             f"the licences differ: {'; '.join(licences)}", remedy="join data sets of one licence"
         )
     sources = Counter(part.source for part in parts)
+    notes = [f"{len(parts)} joined; input_sha256 is the digest of their contents"]
+    if note:
+        notes[0] += f"; {note}"
+    notes += dict.fromkeys(part.notes for part in parts if part.notes)
     return Provenance(
         source="; ".join(f"{n} of: {one}" if n > 1 else one for one, n in sources.items()),
         command=command,
         input_sha256=hashlib.sha256("\n".join(contents).encode()).hexdigest(),
         licence=next(iter(licences)),
         palpate_version=__version__,
-        notes=f"{len(parts)} joined; input_sha256 is the digest of their contents",
+        notes="; of parts: ".join(notes),
     )
 
 
@@ -134,7 +139,8 @@ def sha256_of(path: Path) -> str:
 def csv_rows(path: Path, refuse: type[DatasetError] | type[ConfigError]) -> list[list[str]]:
     """Rows of a CSV file as words; ``refuse`` is raised where it cannot be read."""
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        # Spreadsheets begin a file with a byte order mark.
+        with path.open(encoding="utf-8-sig", newline="") as file:
             return list(csv.reader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise refuse(f"{path} cannot be read: {error}", remedy="check the path") from error

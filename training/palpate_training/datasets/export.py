@@ -18,6 +18,7 @@ from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate.files.hdf5 import new_file
 from palpate.messages import COUNTS_MAX
+from palpate_training.datasets.container import StoredColumn, write_array
 from palpate_training.datasets.experiment import ExperimentDataset, MixedDataset
 from palpate_training.datasets.features import ELECTRODES, FeatureDataset, FloatArray
 from palpate_training.datasets.published import published_file
@@ -41,7 +42,8 @@ def export_published(folder: Path, data: ExperimentDataset | MixedDataset) -> li
 
     The number is the one that the unit's name ends with (``biotac-3``), else its place. Groups
     ``electrode_vals``, ``contact_loc`` [m], ``force_vec`` [N] and ``indenter_type`` have an array
-    ``data`` each; the attribute ``names`` of the last maps its numbers to indenters. Of a
+    ``data`` each; the attribute ``names`` of the last maps its numbers to indenters. The
+    group ``trajectory`` names the trajectory of each row, by places in its array ``names``. Of a
     mixed data set ``biotac1_simulated.hdf5`` and so on hold the simulated force ``force_res`` [N]
     and the nodal displacement ``nodal_res`` [m], row by row. The folder must not exist, and appears
     complete or not at all.
@@ -142,6 +144,11 @@ def _write_unit(path: Path, rows: ExperimentDataset, trials: Any) -> None:
             )
             if group == "indenter_type":
                 dataset.attrs["names"] = kinds
+        mine_at = rows.row_trajectory[mine]
+        held, place = np.unique(mine_at, return_inverse=True)
+        write_array(file, "trajectory/data", StoredColumn("1", np.int64), place)
+        names = np.array([rows.trajectories[i] for i in held], dtype=object)
+        write_array(file, "trajectory/names", StoredColumn("1", str), names)
 
 
 def _write_simulated(path: Path, data: MixedDataset, trials: Any) -> None:

@@ -436,6 +436,10 @@ def check_forces(force: npt.NDArray[np.floating], rows: npt.NDArray[np.int64], n
         )
 
 
+LOCATION_MOST_M = 0.1
+"""No contact is further from the origin of the sensor frame on a fingertip 28 mm long [m]."""
+
+
 def _check_shapes(data: FeatureDataset) -> None:
     rows = len(data.electrodes)
     if rows == 0:
@@ -474,6 +478,17 @@ def _check_values(data: FeatureDataset) -> None:
                 f"{data.name}: {name} is not finite in row {bad[0]} ({bad.size} rows in all)",
                 remedy="drop these rows where the data set is made",
             )
+    for name in ("contact_location", "centre_of_pressure"):
+        # Half of the rows: of a robot that is away, noise of the force alone may say contact.
+        if name in must_be_finite and touching.any():
+            away = np.median(np.linalg.norm(must_be_finite[name][touching], axis=1))
+            if away > LOCATION_MOST_M:
+                raise DatasetError(
+                    f"{data.name}: half of {name} is {away:.4g} m and more from the origin of the"
+                    f" sensor frame; on a fingertip it is below {LOCATION_MOST_M:g} m",
+                    remedy="give metres in the sensor frame (a table in mm says so in its column"
+                    " map: length_unit)",
+                )
     check_rest(data.baseline, np.arange(len(data)), data.name)
     if data.contact_normal is not None:
         length = np.linalg.norm(data.contact_normal[touching], axis=1)
@@ -535,12 +550,21 @@ _CHUNK_ROWS = 4096
 """One chunk of electrodes is 150 KiB: small enough to stream, large enough to compress."""
 
 
+SENSORS_MOST = 4000
+"""Their names are one attribute of the file, of which HDF5 takes 64 KiB, and 16 bytes a name."""
+
+
 def write_dataset(path: Path, data: FeatureDataset) -> str:
     """Write a data set, complete or not at all; returns the content's SHA-256, hex.
 
     Raises:
-        DatasetError: The disk refused.
+        DatasetError: There are more than ``SENSORS_MOST`` sensors, or the disk refused.
     """
+    if len(data.sensor_names) > SENSORS_MOST:
+        raise DatasetError(
+            f"{path}: {len(data.sensor_names)} sensors are more than a file holds: {SENSORS_MOST}",
+            remedy="write several data sets with fewer sensors each",
+        )
     digest = data.content_sha256()
     with hdf5_written_whole(path, extra="training") as file:
         names = {"sensor_names": list(data.sensor_names)}

@@ -217,7 +217,16 @@ def _align(
             path,
             never,
         )
-    _log.info("%s: %d of %d frames of %s kept", path, kept.sum(), len(streams.frames), name)
+    unusable = len(streams.frames) - len(frames)
+    apart = len(frames) - int(kept.sum()) - overloaded  # these are told already
+    if unusable or apart:
+        pair = "force and pose" if streams.poses else "force"
+        left_out = (
+            f"{unusable + apart} of {len(streams.frames)} frames of {name} left out: {unusable} not"
+            f" valid or with no tare in the record, {apart} with no {pair} within three periods"
+        )
+        notes.append(left_out)
+        _log.warning("%s: %s", path, left_out)
 
     baseline = np.array([streams.tares[frame.tare_id].electrodes for frame in frames])
     columns: dict[str, npt.NDArray[Any]] = {

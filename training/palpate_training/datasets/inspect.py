@@ -19,7 +19,7 @@ from palpate_training.datasets.experiment import (
     read_experiment,
     read_mixed,
 )
-from palpate_training.datasets.published import UNITS, published_file, read_published
+from palpate_training.datasets.published import published_unit, read_published
 
 PUBLISHED = "published layout"
 
@@ -102,15 +102,12 @@ def load(
         DatasetError: It is none of these, or damaged.
     """
     if path.is_dir():
-        there = [unit for unit in UNITS if published_file(path, unit).is_file()]
+        return PUBLISHED, read_published(path, axes=axes, force_on_indenter=force_on_indenter)
+    unit = published_unit(path)
+    if unit is not None:
         return PUBLISHED, read_published(
-            path, units=there or None, axes=axes, force_on_indenter=force_on_indenter
+            path.parent, units=[unit], axes=axes, force_on_indenter=force_on_indenter
         )
-    for unit in UNITS:
-        if path == published_file(path.parent, unit):
-            return PUBLISHED, read_published(
-                path.parent, units=[unit], axes=axes, force_on_indenter=force_on_indenter
-            )
     schema = schema_of(path, extra="training")
     if schema == EXPERIMENT_SCHEMA.name:
         return schema, read_experiment(path)

@@ -44,7 +44,7 @@ _ROWS = 256
 """Rows whose fields are in memory at once."""
 
 PressStarts = Mapping[str, tuple[str, FloatArray]]
-"""By trajectory: its indenter, and the tip where it begins [m], sensor frame, (3,)."""
+"""By trajectory of one plan: its indenter, and the tip where it begins [m], sensor frame, (3,)."""
 
 Fields = Sequence[tuple[FieldBasis, FloatArray]]
 """Bases, each with the coefficients (N, K) of the rows that it holds."""
@@ -74,9 +74,9 @@ def join_files(
         )
     parts = [read_mixed(path) for path in paths]
     refuse_repeated(paths, [(part.experiment.tared, part.experiment.force) for part in parts])
-    starts = [press_starts(part.experiment) for part in parts]
+    starts = [press_starts(part.experiment).values() for part in parts]
     for (a, one), (b, other) in itertools.combinations(zip(paths, starts, strict=True), 2):
-        if pressed_alike(one, other):
+        if any(pressed_alike(*pair) for pair in itertools.product(one, other)):
             raise DatasetError(
                 f"{a} and {b} hold the same trajectories, pressed on different specimens",
                 remedy="make one data set of all specimens: joined, a trajectory would be learned "
@@ -142,19 +142,17 @@ def join_mixed(
             coefficients=numbers,
             basis=of_forces,
         )
-    where = joined_provenance(
-        [part.experiment.provenance for part in parts], [*map(content_sha256, parts)], command
-    )
-    notes = [
-        f"{where.notes}; nodes are those of {names[0]}, the others' up to"
+    note = (
+        f"nodes are those of {names[0]}, the others' up to"
         f" {apart * 1e3:.2f} mm away; losses of fields are beside theirs, which themselves lose up"
         f" to {_largest_losses([one.basis for one in parts], 'm of the displacement')}"
-    ]
+    )
     if contacts:
-        notes[0] += f", {_largest_losses([c.basis for c in contacts], 'N of the contact forces')}"
-    # A part that was joined or shrunk itself says there what was lost before.
-    notes += dict.fromkeys(text for one in parts if (text := one.experiment.provenance.notes))
-    where = replace(where, notes="; of parts: ".join(notes))
+        note += f", {_largest_losses([c.basis for c in contacts], 'N of the contact forces')}"
+    # Notes of a part that was joined or shrunk itself say what was lost before.
+    where = joined_provenance(
+        [part.experiment.provenance for part in parts], [*map(content_sha256, parts)], command, note
+    )
     return MixedDataset(
         experiment=join_experiments([part.experiment for part in parts], names, where),
         simulated_force=np.concatenate([part.simulated_force for part in parts]),
@@ -170,14 +168,21 @@ def _largest_losses(bases: Sequence[FieldBasis], what: str) -> str:
     return f"{mean:.3g} {what} on average, {most:.3g} at most"
 
 
-def press_starts(data: ExperimentDataset) -> PressStarts:
-    """Where each trajectory begins, by the first trial of it."""
+def press_starts(data: ExperimentDataset) -> dict[str, PressStarts]:
+    """Where each trajectory begins, by the first trial of it.
+
+    Returns:
+        By what joining put before the ids of a part, such as ``one/``, or nothing, its trajectories
+        by their own ids, which begin with the indenter.
+    """
     numbers, trial = np.unique(data.trial_trajectory, return_index=True)
     tips = data.location[np.searchsorted(data.trial, trial)]
-    return {
-        data.trajectories[number]: (data.indenters[number], tip)
-        for number, tip in zip(numbers, tips, strict=True)
-    }
+    parts: dict[str, dict[str, tuple[str, FloatArray]]] = {}
+    for number, tip in zip(numbers, tips, strict=True):
+        name, indenter = data.trajectories[number], data.indenters[number]
+        own = max(0, f"/{name}".rfind(f"/{indenter}/"))
+        parts.setdefault(name[:own], {})[name[own:]] = (indenter, tip)
+    return dict(parts)
 
 
 def pressed_alike(one: PressStarts, other: PressStarts) -> bool:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ from palpate_training.datasets.features import (
     STEP_TOLERANCE,
     FeatureDataset,
     period_of_steps,
+    recording_of,
 )
 from palpate_training.datasets.tables import LISTS, METADATA, facts_of, read_table
 
@@ -52,7 +54,8 @@ def export_lerobot(folder: Path, data: FeatureDataset, *, fps: float | None = No
 
     Args:
         folder: Must not exist.
-        data: Rows; where nothing touches, what only a contact has is NaN.
+        data: Rows; where nothing touches, what only a contact has is NaN. Rows of several fingers
+            that lie between one another are written finger after finger.
         fps: Rows a second; None = what the rows' times say.
 
     Raises:
@@ -63,6 +66,7 @@ def export_lerobot(folder: Path, data: FeatureDataset, *, fps: float | None = No
     arrow = require("pyarrow", extra="training")
     import pyarrow.parquet as parquet
 
+    data = _recordings_apart(data)
     rate = _rate(data, fps)
     episode = _episodes(data, rate)
     starts = np.flatnonzero(np.diff(episode, prepend=-1))
@@ -139,6 +143,16 @@ def read_lerobot(folder: Path) -> pa.Table:
         raise DatasetError(
             f"{folder}: its files have different columns: {error}", remedy="fetch it again"
         ) from error
+
+
+def _recordings_apart(data: FeatureDataset) -> FeatureDataset:
+    """The same rows, so that those of a sensor and group follow one another."""
+    recording = recording_of(data)
+    if 1 + np.count_nonzero(np.diff(recording)) == len(np.unique(recording)):
+        return data
+    order = np.lexsort((np.arange(len(data)), data.group, data.sensor))
+    columns: dict[str, Any] = {name: array[order] for name, array in data.arrays().items()}
+    return replace(data, **columns)
 
 
 def _rate(data: FeatureDataset, fps: float | None) -> float:

@@ -1,19 +1,22 @@
-"""The paper's own files, ``biotac1.hdf5`` to ``biotac3.hdf5``, as an experiment's data set.
+"""The published layout, ``biotac1.hdf5`` and so on, as an experiment's data set.
 
-Known of them: groups ``electrode_vals``, ``contact_loc``, ``force_vec`` and ``indenter_type``, each
-with an array ``data``, and rows in order of trajectories (as the ACROSS framework reads them).
+Known of the paper's own files, ``biotac1.hdf5`` to ``biotac3.hdf5``: groups ``electrode_vals``,
+``contact_loc``, ``force_vec`` and ``indenter_type``, each with an array ``data``, and rows in order
+of trajectories (as the ACROSS framework reads them).
 Their frame and their side of the force are not written down, so both can be given, and are checked:
 the pad looks to -z, and what presses it pushes towards +z.
 
-Trajectories in published rows, which name none: where each begins, and which are the same.
-
-A published file holds the rows of one BioTac, trajectory after trajectory, each beginning with a
-row at exactly 0.5 N (paper, section "Experimental data processing").
+A file that palpate exported names the trajectory of each row, in the group ``trajectory``: numbers
+in ``data``, which are places in ``names``. The paper's name none, so trajectories are found: where
+each begins, and which are the same. A published file holds the rows of one BioTac, trajectory after
+trajectory, each beginning with a row at exactly 0.5 N (paper, section "Experimental data
+processing").
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +32,7 @@ from palpate.process import require
 from palpate_training.datasets.assembly import assemble_experiment
 from palpate_training.datasets.container import Provenance, read_provenance
 from palpate_training.datasets.experiment import ExperimentDataset
-from palpate_training.datasets.features import ELECTRODES
+from palpate_training.datasets.features import ELECTRODES, LOCATION_MOST_M
 from palpate_training.datasets.processing import THRESHOLD_N
 from palpate_training.datasets.trials import TrialHeader, TrialRows
 
@@ -52,13 +55,25 @@ GROUPS: dict[str, tuple[str, ...]] = {
 LARGEST_FORCE_N = 100.0
 """The paper's largest is 32.1 N."""
 
-LARGEST_M = (0.004, 0.1)
+LARGEST_M = (0.004, LOCATION_MOST_M)
 """Between these lies the largest coordinate of a contact on a fingertip 28 mm long [m]."""
 
 
 def published_file(folder: Path, unit: int) -> Path:
     """Where the rows of a BioTac are."""
     return folder / f"biotac{unit}.hdf5"
+
+
+def published_unit(path: Path) -> int | None:
+    """Number of the BioTac whose rows a file has by its name; None for any other name."""
+    found = re.fullmatch(r"biotac(0|[1-9][0-9]*)\.hdf5", path.name)
+    return int(found[1]) if found else None
+
+
+def published_units(folder: Path) -> list[int]:
+    """Numbers of the BioTacs whose rows are in a folder, ascending."""
+    numbers = map(published_unit, folder.glob("biotac*.hdf5"))
+    return sorted(number for number in numbers if number is not None)
 
 
 def read_published(
@@ -72,8 +87,8 @@ def read_published(
     """Read the published layout and find its trajectories.
 
     Args:
-        folder: With ``biotac1.hdf5``, ``biotac2.hdf5`` and ``biotac3.hdf5``.
-        units: BioTacs to read; None = all three, and it is an error if one is missing.
+        folder: With ``biotac1.hdf5`` and so on.
+        units: Numbers of the BioTacs to read; None = all that are there.
         axes: Where the sensor frame's x, y and z are in the file: ``("x", "-z", "y")`` if its y is
             dorsal.
         force_on_indenter: Whether the file holds the force on the indenter, of opposite sign.
@@ -99,7 +114,7 @@ def read_published(
                 remedy="copy each BioTac's own file",
             )
         digests[file.sha256] = file.path
-    runs = [find_runs(str(f.path), f.force, f.location, f.indenter) for f in files]
+    runs = [find_runs(str(f.path), f.force, f.location, f.indenter, f.trajectory) for f in files]
     names = name_trajectories(runs)
     trials = [
         _trial(f"biotac-{unit}", file, run, name)
@@ -109,6 +124,13 @@ def read_published(
     # An export of palpate's own says where it comes from; the publisher's files do not.
     sources = dict.fromkeys(f.provenance.source for f in files if f.provenance.source)
     licences = dict.fromkeys(f.provenance.licence for f in files if f.provenance.licence)
+    named = all(file.trajectory is not None for file in files)
+    found = (
+        "as the files name them"
+        if named
+        else "found by indenter, fall of the force to 0.5 N and jumps of the tip, and matched over"
+        " units by place and direction"
+    )
     published = "published experiment of Narang et al.: " + ", ".join(f.path.name for f in files)
     provenance = Provenance(
         source="; ".join(sources) or published,
@@ -116,24 +138,23 @@ def read_published(
         input_sha256=hashlib.sha256("".join(f.sha256 for f in files).encode()).hexdigest(),
         licence="; ".join(licences) or "the publisher's; see where it was downloaded",
         palpate_version=__version__,
-        notes=f"axes {','.join(axes)}; location was in {files[0].location_unit}; trajectories found"
-        " by indenter, fall of the force to 0.5 N and jumps of the tip, and matched over units by"
-        " place and direction; input_sha256 is of the arrays",
+        notes=f"axes {','.join(axes)}; location was in {files[0].location_unit};"
+        f" trajectories {found}; input_sha256 is of the arrays",
     )
     return assemble_experiment(trials, provenance)
 
 
 def _present(folder: Path, units: Sequence[int] | None) -> list[int]:
-    wanted = list(UNITS if units is None else units)
-    missing = [published_file(folder, unit).name for unit in wanted]
-    missing = [name for name in missing if not (folder / name).is_file()]
+    there = published_units(folder)
+    if units is None and not there:
+        raise DatasetError(
+            f"{folder} holds none of the published files"
+            f" {', '.join(published_file(folder, unit).name for unit in UNITS)}",
+            remedy=f"download them; or, of another data set, {name_a_file(folder)}",
+        )
+    wanted = there if units is None else list(units)
+    missing = [published_file(folder, unit).name for unit in wanted if unit not in there]
     if missing or not wanted:
-        there = [unit for unit in UNITS if published_file(folder, unit).is_file()]
-        if units is None and not there:
-            raise DatasetError(
-                f"{folder} holds none of the published files {', '.join(missing)}",
-                remedy=f"download them; or, of another data set, {name_a_file(folder)}",
-            )
         raise DatasetError(
             f"{folder}: {', '.join(missing) or 'no unit'} is missing",
             remedy=f"download it, or choose among the units that are there: {there or 'none'}",
@@ -151,6 +172,7 @@ class _PublishedFile:
                 name: file[_group(path, file, name)]["data"][()] for name in GROUPS
             }
             names = file[_group(path, file, "indenter")]["data"].attrs.get("names")
+            self.trajectory = _stated_trajectories(path, file, len(arrays["indenter"]))
             self.provenance = read_provenance(file.attrs)
         rows = len(arrays["electrodes"])
         for name, columns in (("electrodes", ELECTRODES), ("location", 3), ("force", 3)):
@@ -265,6 +287,22 @@ def _indenters(path: Path, kinds: npt.NDArray[Any], names: Any) -> Texts:
     return np.array([text(names[int(kind)]) for kind in kinds], dtype=object)
 
 
+def _stated_trajectories(path: Path, file: h5py.File, rows: int) -> Texts | None:
+    """Id of each row's trajectory, of a file that palpate exported; None where it states none."""
+    if "trajectory/data" not in file or "trajectory/names" not in file:
+        return None
+    number = file["trajectory/data"][()].reshape(-1)
+    names = np.array([text(name) for name in file["trajectory/names"][()]], dtype=object)
+    known = np.isin(number, np.arange(len(names))).all()
+    if number.dtype.kind not in "iu" or len(number) != rows or not known:
+        raise DatasetError(
+            f"{path}: trajectory has {len(number)} numbers for {rows} rows, or one that has no name"
+            f" in its list of {len(names)}",
+            remedy="export the file again",
+        )
+    return np.asarray(names[number])
+
+
 def _check_unique(path: Path, rows: Floats) -> None:
     _, first, counts = np.unique(rows, axis=0, return_index=True, return_counts=True)
     if (counts > 1).any():
@@ -310,9 +348,9 @@ JUMP_M = 0.5e-3
 SAME_PLACE_M = 1.5e-3
 """How far apart one trajectory may begin on two BioTacs: registration error plus 0.5 N's depth."""
 
-SAME_DIRECTION = np.cos(np.radians(12.0))
-"""Cosine of the angle that two BioTacs' paths of one trajectory may differ by; planned ones of one
-point differ by 30 degrees or more."""
+SAME_DIRECTION = np.cos(np.radians(15.0))
+"""Cosine of the angle that two BioTacs' paths of one trajectory may differ by: half of the 30
+degrees or more by which planned ones of one point differ."""
 
 MIN_PATH_M = 0.3e-3
 """A shorter path has no direction worth comparing."""
@@ -328,6 +366,7 @@ class PublishedRun:
         start: Tip at 0.5 N [m], shape (3,).
         direction: Of the path, a unit vector; zero where the path is too short.
         travel_m: Of each row along the path, from 0 [m], shape (R,).
+        trajectory: Its id, where the file states it.
     """
 
     rows: slice
@@ -335,17 +374,28 @@ class PublishedRun:
     start: Floats
     direction: Floats
     travel_m: Floats
+    trajectory: str = ""
 
 
-def find_runs(name: str, force: Floats, location: Floats, indenter: Texts) -> list[PublishedRun]:
+def find_runs(
+    name: str,
+    force: Floats,
+    location: Floats,
+    indenter: Texts,
+    trajectory: Texts | None = None,
+) -> list[PublishedRun]:
     """Cut the rows of a file into trajectories.
 
-    A trajectory begins where the indenter changes, where the force (N, 3) [N] falls back to 0.5 N,
-    or where the tip (N, 3) [m] jumps.
+    A trajectory begins where its id changes. Where ids are not known, it begins where the indenter
+    changes, where the force (N, 3) [N] falls back to 0.5 N, or where the tip (N, 3) [m] jumps.
 
     Raises:
-        DatasetError: Most rows stand alone, so they are in no order of trajectories.
+        DatasetError: Ids are not known, and most rows stand alone, so they are in no order of
+            trajectories.
     """
+    if trajectory is not None:
+        begins = np.append(True, trajectory[1:] != trajectory[:-1])
+        return _cut(begins, location, indenter, trajectory)
     magnitude = np.linalg.norm(force, axis=1)
     begins = np.ones(len(force), np.bool_)
     begins[1:] = (
@@ -353,41 +403,51 @@ def find_runs(name: str, force: Floats, location: Floats, indenter: Texts) -> li
         | ((magnitude[1:] <= FALLEN_N) & (magnitude[1:] < magnitude[:-1]))
         | (np.linalg.norm(np.diff(location, axis=0), axis=1) > JUMP_M)
     )
-    starts = np.flatnonzero(begins)
-    ends = np.append(starts[1:], len(force))
-    alone = int(np.sum(ends - starts == 1))
-    if alone > len(starts) / 2 and len(starts) > 1:
+    runs = _cut(begins, location, indenter, np.full(len(force), "", dtype=object))
+    alone = sum(len(run.travel_m) == 1 for run in runs)
+    if alone > len(runs) / 2 and len(runs) > 1:
         raise DatasetError(
-            f"{name}: {alone} of {len(starts)} trajectories have a single row, so the rows are in"
+            f"{name}: {alone} of {len(runs)} trajectories have a single row, so the rows are in"
             " no order of trajectories",
             remedy="use the file as published; a shuffled copy has lost its trajectories",
         )
+    return runs
+
+
+def _cut(
+    begins: npt.NDArray[np.bool_], location: Floats, indenter: Texts, trajectory: Texts
+) -> list[PublishedRun]:
+    starts = np.flatnonzero(begins)
+    ends = np.append(starts[1:], len(begins))
     return [
-        _run(slice(int(a), int(b)), str(indenter[a]), location[a:b])
+        _run(slice(int(a), int(b)), str(indenter[a]), location[a:b], str(trajectory[a]))
         for a, b in zip(starts, ends, strict=True)
     ]
 
 
-def _run(rows: slice, indenter: str, tip: Floats) -> PublishedRun:
+def _run(rows: slice, indenter: str, tip: Floats, trajectory: str) -> PublishedRun:
     way = tip[-1] - tip[0]
     length = float(np.linalg.norm(way))
     along = way / length if length > 0.0 else np.zeros(3)
     # Noise of the tip must not make travel run backward.
     travel_m = np.maximum.accumulate((tip - tip[0]) @ along)
     direction = along if length >= MIN_PATH_M else np.zeros(3)
-    return PublishedRun(rows, indenter, tip[0], direction, travel_m)
+    return PublishedRun(rows, indenter, tip[0], direction, travel_m, trajectory)
 
 
 def name_trajectories(units: list[list[PublishedRun]]) -> list[list[str]]:
     """Give the same id to runs of different BioTacs that are the same trajectory.
 
-    Such have the same indenter, begin in nearly the same place and go in nearly the same direction;
-    each BioTac has a trajectory once, so they are assigned one to one. What is on one side only, or
-    too short to compare, gets an id of its own.
+    Where all files state ids, these are taken. Else such runs have the same indenter, begin in
+    nearly the same place and go in nearly the same direction, which is not asked of a path that is
+    too short to have one; each BioTac has a trajectory once, so they are assigned one to one. What
+    is on one side only gets an id of its own.
 
     Returns:
-        Ids ``<indenter>/<number>``, in the same order.
+        Stated ids, or ``<indenter>/<number>``, in the same order.
     """
+    if all(run.trajectory for runs in units for run in runs):
+        return [[run.trajectory for run in runs] for runs in units]
     assign = require("scipy.optimize", extra="training").linear_sum_assignment
     known: dict[str, list[PublishedRun]] = {}
     names: list[list[str]] = []
@@ -414,7 +474,9 @@ def name_trajectories(units: list[list[PublishedRun]]) -> list[list[str]]:
 def _distance(one: PublishedRun, other: PublishedRun) -> float:
     """How unlike two runs are, in metres; infinite where they cannot be the same trajectory."""
     apart_m = float(np.linalg.norm(one.start - other.start))
-    cosine = float(one.direction @ other.direction)
+    # The place alone says less than place and direction, so others are preferred.
+    compared = one.direction.any() and other.direction.any()
+    cosine = float(one.direction @ other.direction) if compared else float(SAME_DIRECTION)
     if apart_m > SAME_PLACE_M or cosine < SAME_DIRECTION:
         return np.inf
     return apart_m + SAME_PLACE_M * (1.0 - cosine)

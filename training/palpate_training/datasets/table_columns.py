@@ -110,9 +110,13 @@ class TableColumns:
 
     def _column(self, name: str, wanted: str = "numbers") -> Values:
         """Numbers of one column, shape (N,); a minus before its name turns the sign."""
-        plain = name.removeprefix("-") if name not in self._table.column_names else name
+        plain = self._plain(name)
         values = np.asarray(self._cast(plain, "float64", wanted).to_numpy(), np.float64)
         return values if plain == name else -values
+
+    def _plain(self, name: str) -> str:
+        """Name of the column, without a minus that turns its sign."""
+        return name if name in self._table.column_names else name.removeprefix("-")
 
     def _cast(self, name: str, kind: str, wanted: str, *, safe: bool = False) -> Any:
         column = self._found(name)
@@ -122,18 +126,20 @@ class TableColumns:
             raise self._other_type(name, wanted) from error
 
     def _lists(self, name: str, width: int) -> Values:
-        column = self._found(name)
+        plain = self._plain(name)
+        column = self._found(plain)
         if "list" not in str(column.type):
             return self.numbers([name], width)
         rows = column.to_pylist()
         for number, row in enumerate(rows):
             if row is None or len(row) != width:
                 size = "nothing" if row is None else f"{len(row)} numbers"
-                raise self._wrong(name, number, size, f"{width} numbers")
+                raise self._wrong(plain, number, size, f"{width} numbers")
         try:
-            return np.array(rows, np.float64)
+            values = np.array(rows, np.float64)
         except (ValueError, TypeError) as error:  # of lists of text, or of lists
-            raise self._other_type(name, "lists of numbers") from error
+            raise self._other_type(plain, "lists of numbers") from error
+        return values if plain == name else -values
 
     def _other_type(self, name: str, wanted: str) -> DatasetError:
         return DatasetError(

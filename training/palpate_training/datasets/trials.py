@@ -68,7 +68,7 @@ PRESS_KINDS = ("normal", "angled", "path", "random")
 def press_kind(trajectory: str) -> str:
     """Kind of a trajectory by its id, one of ``PRESS_KINDS``; empty where the id does not tell it.
 
-    Those of published files do not: they are ``<indenter>/<number>``.
+    Those of the paper's files do not: they are ``<indenter>/<number>``.
     """
     kind = trajectory.rpartition("/")[2].partition("-")[0]
     return kind if kind in PRESS_KINDS else ""
@@ -280,10 +280,10 @@ def _contents(path: Path, file: h5py.File) -> TrialsContents:
         if name not in file.attrs:
             raise DatasetError(f"{path}: attribute {name} is missing", remedy=_AGAIN)
     count = int(file.attrs["trial_count"])
-    held = sorted(file[GROUP]) if GROUP in file else []
+    held = set(file[GROUP]) if GROUP in file else set()
     expected = [_name(number).removeprefix(f"{GROUP}/") for number in range(count)]
-    if held != expected:
-        absent = sorted(set(expected) - set(held))
+    if held != set(expected):
+        absent = sorted(set(expected) - held)
         what = f"group {GROUP}/{absent[0]} is missing" if absent else f"has {len(held)} groups"
         raise DatasetError(f"{path}: {what}; the file says {count} trials", remedy=_AGAIN)
     seen: set[tuple[str, str]] = set()
