@@ -209,7 +209,8 @@ def _trajectories(group: Any, kind: type, above: str = "") -> dict[str, Any]:
         if not isinstance(child, kind):
             continue
         inner = _trajectories(child, kind, f"{above}{name}/")
-        has_arrays = any(array in child and not isinstance(child[array], kind) for array in COLUMNS)
+        held = group[name]
+        has_arrays = any(array in held and not isinstance(held[array], kind) for array in COLUMNS)
         if has_arrays or not inner:
             found[above + name] = child
         found |= inner
