@@ -7,6 +7,7 @@ import errno
 import gc
 import io
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -401,6 +402,21 @@ def test_recovery_replaces_no_other_file_and_leaves_whole_records(
     (tmp_path / "cut.recovered.mcap").rename(tmp_path / "cut.recovered.mcap.part")
     assert summarise(recover(part).path).counts == {KEY: 300}
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.recovered.mcap", "run.mcap"]
+
+
+def test_a_recovery_that_the_disk_refuses_leaves_nothing(long_record: Path, tmp_path: Path) -> None:
+    """Half a copy kept the disk full, and its recorder paused."""
+    part = tmp_path / "cut.mcap.part"
+    part.write_bytes(long_record.read_bytes()[:-200])
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (part.stat().st_size // 4, hard))
+    try:
+        with pytest.raises(RecordingError, match=r"cut\.recovered\.mcap.*File too large"):
+            recover(part)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.mcap.part", "run.mcap"]
+    assert summarise(recover(part).path).counts == {KEY: 300}
 
 
 def test_a_file_without_a_whole_message_is_not_sent_in_a_circle(tmp_path: Path) -> None:
