@@ -15,7 +15,6 @@ import hashlib
 import io
 import json
 import math
-import os
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -344,8 +343,6 @@ def write_tape(path: Path, tape: Tape) -> bytes:
                 buffer = io.BytesIO()
                 np.lib.format.write_array(buffer, array, allow_pickle=False)
                 archive.writestr(member, buffer.getvalue())
-        file.flush()
-        os.fsync(file.fileno())
     return bytes.fromhex(header["sha256"])
 
 
