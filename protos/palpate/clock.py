@@ -28,6 +28,8 @@ def _clock_id() -> int:
 CLOCK_ID = _clock_id()
 """Names this host's monotonic clock in ``Stamp.clock_id``."""
 
+EARLIEST_WALL_S = 1_704_067_200.0
+"""A wall clock that says an earlier time, before 2024, has not been set [s]."""
 
 SAME_HOST_AHEAD_S = 0.005
 """A reading of this host may be so far in the future [s]: its time is an estimate from its device's

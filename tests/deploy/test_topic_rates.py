@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from palpate.bus import TapSample
-from palpate.bus.topics import ELECTRODES, Topic
+from palpate.bus.topics import ELECTRODES, Topic, sensor_key
 from palpate.config import LinkConfig
 from palpate.files.record import read_record
 from palpate_deploy.diagnose import topics
@@ -43,6 +45,33 @@ def test_what_it_could_not_take_itself_is_no_loss_of_the_stream(
     assert (numbers["lost"], numbers["overflow"]) == (1, 2)
     topics.print_rates(electrodes, {"finger": rate})
     assert "lost 1  overflow 2" in capsys.readouterr().out
+
+
+def test_what_it_keeps_does_not_grow_with_time() -> None:
+    """It kept each gap, and went through all of them for each line."""
+    gaps_s = 0.01 + 1e-4 * np.random.default_rng(1).standard_normal(20_000)
+    arrivals_ns = np.cumsum([10**9, *(gaps_s * 1e9).astype(int)])
+    electrodes: Topic[Any] = ELECTRODES
+    rate = topics.StreamRate()
+    key = sensor_key("lab", "finger", ELECTRODES.name)
+    tracemalloc.start()
+    try:
+        for at_ns in arrivals_ns.tolist():
+            rate.add(
+                electrodes,
+                TapSample("electrodes", "lab", "finger", key, "", b"\xff", at_ns, at_ns),
+            )
+        kept, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept < 50_000  # a list of the gaps has 600 kB
+    numbers = rate.summary()
+    seconds = np.diff(arrivals_ns) * 1e-9
+    assert numbers["rate_hz"] == pytest.approx(1 / seconds.mean())
+    assert numbers["min_s"] == pytest.approx(seconds.min())
+    assert numbers["max_s"] == pytest.approx(seconds.max())
+    assert numbers["std_s"] == pytest.approx(seconds.std())
+    assert numbers["rejected"] == 20_001
 
 
 @pytest.mark.parametrize("report_s", [0.05, 60.0])

@@ -7,6 +7,7 @@ import errno
 import gc
 import io
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -18,10 +19,12 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 
 from palpate.bus.topics import ELECTRODES, FEATURES, FIELD, SYNTHESIS, sensor_key
 from palpate.codec import ELECTRODE_FRAME, WRENCH_FRAME
 from palpate.errors import RecordingError, WireError
+from palpate.files import record_writer
 from palpate.files.record import check_readable, only_name, read_record, recover, summarise
 from palpate.files.record_writer import RecordWriter, descriptor_set
 from palpate.messages import Stamp
@@ -210,8 +213,9 @@ def test_every_truncation_is_noticed_and_whole_messages_are_recovered(
 
 
 @pytest.fixture
-def long_record(tmp_path: Path, payload: bytes) -> Path:
+def long_record(tmp_path: Path, payload: bytes, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Thirty chunks of ten messages."""
+    monkeypatch.setattr(record_writer, "FLUSH_S", float("inf"))  # however slow this host is
     path = tmp_path / "run.mcap"
     with RecordWriter(path, {"station": "lab"}) as writer:
         for i in range(300):
@@ -221,12 +225,16 @@ def long_record(tmp_path: Path, payload: bytes) -> Path:
     return path
 
 
-def chunks_of(record: Path) -> list[int]:
-    """Where the chunks begin."""
+def indices_of(record: Path) -> list[ChunkIndex]:
     with record.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
-    return [index.chunk_start_offset for index in summary.chunk_indexes]
+    return summary.chunk_indexes
+
+
+def chunks_of(record: Path) -> list[int]:
+    """Where the chunks begin."""
+    return [index.chunk_start_offset for index in indices_of(record)]
 
 
 @pytest.mark.parametrize("where", ["within a chunk", "over heads of records", "first chunk"])
@@ -286,6 +294,60 @@ def test_a_chunk_that_says_it_is_something_else_is_missed_and_saved(
         assert found.original is not None
 
 
+@pytest.mark.parametrize("of", ["chunk", "index behind it"])
+@pytest.mark.parametrize("bit", [0, 4, 8, 9, 10, 11, 12, 13, 19, 24, 25, 40])
+def test_a_flipped_bit_of_a_length_costs_no_other_chunk(
+    long_record: Path, of: str, bit: int
+) -> None:
+    """What a record says to have may reach over good chunks, and over the end of the file."""
+    content = bytearray(long_record.read_bytes())
+    indices = indices_of(long_record)
+    at = indices[10].chunk_start_offset + (0 if of == "chunk" else indices[10].chunk_length)
+    content[at + 1 + bit // 8] ^= 1 << bit % 8
+    part = long_record.with_name("cut.mcap.part")
+    part.write_bytes(content[: indices[29].chunk_start_offset])
+    found = recover(part)
+    sequences = [item.sequence for item in read_record(found.path)]
+    missing = set(range(290)) - set(sequences)
+    assert missing <= set(range(100, 110) if of == "chunk" else ())
+    assert sequences == sorted(set(sequences))
+    if missing:
+        assert found.left_out > 100
+    assert found.places > 0
+    assert part.with_name("cut.mcap.damaged").exists()
+
+
+@pytest.mark.parametrize("of", ["chunk", "index behind it"])
+@pytest.mark.parametrize("last", [20, 29])
+def test_a_length_that_ends_at_a_later_record_is_not_believed(
+    long_record: Path, of: str, last: int
+) -> None:
+    """Nothing behind it looks damaged, and the part was deleted with what lay between."""
+    content = bytearray(long_record.read_bytes())
+    indices = indices_of(long_record)
+    at = indices[10].chunk_start_offset + (0 if of == "chunk" else indices[10].chunk_length)
+    size = indices[last].chunk_start_offset - at - 9
+    content[at + 1 : at + 9] = size.to_bytes(8, "little")
+    part = long_record.with_name("cut.mcap.part")
+    part.write_bytes(content[: indices[29].chunk_start_offset])
+    found = recover(part)
+    assert [item.sequence for item in read_record(found.path)] == list(range(290))
+    assert found.places == 1
+    assert part.with_name("cut.mcap.damaged").exists()
+
+
+@pytest.mark.parametrize("bit", range(8))
+def test_recovery_makes_no_message_of_an_index(long_record: Path, bit: int) -> None:
+    """One flipped bit makes the kinds equal; the index began with the channel and a time."""
+    content = bytearray(long_record.read_bytes())
+    indices = indices_of(long_record)
+    content[indices[10].chunk_start_offset + indices[10].chunk_length] ^= 1 << bit
+    part = long_record.with_name("cut.mcap.part")
+    part.write_bytes(content[: indices[29].chunk_start_offset])
+    found = recover(part)
+    assert [item.sequence for item in read_record(found.path)] == list(range(290))
+
+
 def test_every_flipped_bit_of_the_index_is_noticed(long_record: Path) -> None:
     """Others seek by it: those would miss messages, or fail."""
     content = long_record.read_bytes()
@@ -340,6 +402,21 @@ def test_recovery_replaces_no_other_file_and_leaves_whole_records(
     (tmp_path / "cut.recovered.mcap").rename(tmp_path / "cut.recovered.mcap.part")
     assert summarise(recover(part).path).counts == {KEY: 300}
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.recovered.mcap", "run.mcap"]
+
+
+def test_a_recovery_that_the_disk_refuses_leaves_nothing(long_record: Path, tmp_path: Path) -> None:
+    """Half a copy kept the disk full, and its recorder paused."""
+    part = tmp_path / "cut.mcap.part"
+    part.write_bytes(long_record.read_bytes()[:-200])
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (part.stat().st_size // 4, hard))
+    try:
+        with pytest.raises(RecordingError, match=r"cut\.recovered\.mcap.*File too large"):
+            recover(part)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.mcap.part", "run.mcap"]
+    assert summarise(recover(part).path).counts == {KEY: 300}
 
 
 def test_a_file_without_a_whole_message_is_not_sent_in_a_circle(tmp_path: Path) -> None:

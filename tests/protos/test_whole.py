@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -47,6 +48,25 @@ def test_a_folder_appears_whole_too(tmp_path: Path) -> None:
         write(tmp_path / "bad", fails=True)
     assert list(tmp_path.iterdir()) == [tmp_path / "good"]
     assert (tmp_path / "good" / "file.txt").read_text(encoding="utf-8") == "whole"
+
+
+def test_what_gets_its_name_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a power failure leaves an empty file, or undoes the renaming."""
+    steps: list[int | str] = []
+    monkeypatch.setattr(os, "fsync", lambda number: steps.append(os.fstat(number).st_ino))
+    replace = os.replace
+    monkeypatch.setattr(os, "replace", lambda *paths: (steps.append("named"), replace(*paths)))
+    with written_whole(tmp_path / "file") as partial:
+        partial.write_text("whole", encoding="utf-8")
+    assert steps == [(tmp_path / "file").stat().st_ino, "named", tmp_path.stat().st_ino]
+    steps.clear()
+    with written_whole(tmp_path / "folder") as partial:
+        (partial / "inner").mkdir(parents=True)
+        (partial / "inner" / "file.txt").write_text("whole", encoding="utf-8")
+    folder = tmp_path / "folder"
+    all_of_it = {path.stat().st_ino for path in (folder, *folder.rglob("*"))}
+    assert set(steps[:-2]) == all_of_it
+    assert steps[-2:] == ["named", tmp_path.stat().st_ino]
 
 
 def test_a_disk_that_refuses_is_named(tmp_path: Path) -> None:

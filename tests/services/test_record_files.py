@@ -527,6 +527,56 @@ def test_leftovers_are_recovered_but_not_those_of_the_living(
     assert not list(runs.glob("*.part"))
 
 
+def test_a_recovery_waits_until_there_is_room_for_a_copy(
+    open_files: Any,
+    sample: Callable[[int], TapSample],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    until: Until,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The copy kept the recorder paused, on a disk that was not full without it."""
+    runs = tmp_path / "runs"
+    writer = RecordWriter(runs / "lab-dead.mcap")
+    item = sample(1)
+    writer.write(item.key, item.schema, os.urandom(10**6), log_time_ns=1)
+    writer.flush()
+    writer.abandon()
+    half = runs / "lab-old.recovered.mcap.part"
+    half.write_bytes(bytes(600))
+    free = [10**8 + 10**5]
+    monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
+    monkeypatch.setattr(writer_module.retention, "CHECK_S", 0.0)
+    monkeypatch.setattr(writer_module, "free_bytes", lambda _: free[0])
+    with open_files(min_free_bytes=10**8) as (files, health):
+        until(lambda: not half.exists())
+        until(lambda: "lab-dead.mcap.part waits to be recovered" in caplog.text)
+        for _ in range(5):
+            files.tick()
+        files.write(sample(1))
+        assert health.state is ServiceState.READY
+        assert writer.part.exists()
+        assert caplog.text.count("waits to be recovered") == 1
+        free[0] = 10**9
+        files.tick()
+        until(lambda: health.counters.get("recovered_records") == 1)
+    assert not writer.part.exists()
+    assert sorted(summarise(path).counts[sample(1).key] for path in runs.glob("*.mcap")) == [1, 1]
+
+
+def test_a_fifo_in_the_folder_does_not_hang_the_start(tmp_path: Path) -> None:
+    fifo = tmp_path / "lab.mcap.part"
+    os.mkfifo(fifo)
+    os.utime(fifo, (0, 0))
+    end = os.open(fifo, os.O_RDWR)  # so that it would be opened, and this test does not hang
+    try:
+        assert leftovers(tmp_path) == []
+        with pytest.raises(RecordingError, match=r"lab\.mcap\.part.*not a regular file"):
+            recover(fifo)
+    finally:
+        os.close(end)
+
+
 def test_a_recovery_that_was_killed_is_done_again_at_the_next_start(
     sample: Callable[[int], TapSample], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

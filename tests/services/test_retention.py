@@ -244,6 +244,31 @@ def test_a_record_of_today_stays_after_the_clock_was_put_right(
     assert left(tmp_path) == []
 
 
+def test_a_record_of_before_the_clock_was_set_is_not_old(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A host with a flat battery starts in 2000 or 1970; it removed a record of yesterday."""
+    clocks = [1000.0, time.time()]
+    monkeypatch.setattr(Retention, "_read_clocks", staticmethod(lambda: (clocks[0], clocks[1])))
+    for number, wall_s in ((1, 946_713_600), (2, 60)):
+        os.utime(record(tmp_path, name_of(number)), (wall_s, wall_s))
+    record(tmp_path, name_of(3), age_s=3 * DAY_S)
+    kept, _ = keeper(tmp_path, keep_s=2 * DAY_S)
+
+    def later(seconds: float) -> None:
+        clocks[0] += seconds
+        clocks[1] += seconds
+        kept.apply()
+
+    kept.apply()
+    later(retention.STEADY_S)
+    assert left(tmp_path) == [name_of(1), name_of(2)]
+    later(1.9 * DAY_S)
+    assert left(tmp_path) == [name_of(1), name_of(2)]
+    later(0.1 * DAY_S)
+    assert left(tmp_path) == []
+
+
 class SleepingHost:
     """Clocks of a host that may be suspended, by hand."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import shutil
@@ -194,3 +195,21 @@ def test_what_is_no_public_key_is_refused(content: str, tmp_path: Path) -> None:
         TrustedKeys([tmp_path / "k.pub"])
     with pytest.raises(ConfigError, match="cannot be read"):
         TrustedKeys([tmp_path / "none.pub"])
+
+
+def of_an_unknown_kind(what: str, content: bytes) -> str:
+    """A key in PEM whose algorithm, 1.2.3.4, nobody knows."""
+    code = base64.b64encode(bytes((0x30, len(content))) + content).decode()
+    return f"-----BEGIN {what} KEY-----\n{code}\n-----END {what} KEY-----\n"
+
+
+def test_a_key_of_an_unknown_kind_is_refused(foreign: Path, tmp_path: Path) -> None:
+    algorithm, public, private = bytes.fromhex("300506032a0304"), tmp_path / "k.pub", tmp_path / "k"
+    public.write_text(of_an_unknown_kind("PUBLIC", algorithm + b"\x03\x21\0" + bytes(32)))
+    private.write_text(
+        of_an_unknown_kind("PRIVATE", b"\x02\x01\0" + algorithm + b"\x04\x20" + bytes(32))
+    )
+    with pytest.raises(ConfigError, match="is no public Ed25519 key"):
+        TrustedKeys([public])
+    with pytest.raises(ConfigError, match="is no Ed25519 key"):
+        sign_bundle(read_bundle(foreign), private)

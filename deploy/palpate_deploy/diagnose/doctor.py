@@ -18,6 +18,7 @@ from typing import Literal
 
 from rich.console import Console
 
+from palpate.clock import EARLIEST_WALL_S
 from palpate.config import endpoint_host_port, is_loopback
 from palpate.errors import ConfigError, LinkError, PalpateError
 from palpate.process import state_folder
@@ -52,7 +53,6 @@ _PACKAGES = (
 )
 # Not ros_bag: a bag of ROS 2 is a folder.
 _DRIVERS_OF_A_FILE = ("text_log", "record", "pose_file")
-_YEAR_MIN = 2024
 _ROUTER_WAIT_S = 1.0
 _SLEEP_S = 0.01
 _LATE_WARN_S = 0.005
@@ -301,8 +301,9 @@ def _state(_: Profile) -> Found:
 
 
 def _clock(_: Profile) -> Found:
-    year = time.gmtime().tm_year
-    if year < _YEAR_MIN:
+    wall_s = time.time()
+    if wall_s < EARLIEST_WALL_S:
+        year = time.gmtime(wall_s).tm_year
         return "fail", f"the wall clock says {year}", "set it and synchronise it: chrony"
     lateness = []
     for _attempt in range(50):

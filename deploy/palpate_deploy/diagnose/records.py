@@ -355,8 +355,8 @@ def recover_record(part: Path) -> None:
     """Write ``NAME.recovered.mcap``, and print what it holds and what was left out.
 
     Raises:
-        RecordingError: It is whole or being written, nothing in it can be read, or a file of the
-            new record's name is there.
+        RecordingError: It is whole or being written, nothing in it can be read, the disk refuses
+            the new record, or a file of its name is there.
     """
     found = recover(part)
     print_contents(found.path)

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import enum
 import json
-import statistics
+import math
 import sys
 import time
 from collections import Counter, defaultdict
@@ -209,7 +209,7 @@ class StreamRate:
     ``bytes`` is the size of the payloads, ``rejected`` counts those that do not decode; ``lost``
     are gaps in the sequence numbers of contiguous streams, ``overflow`` messages that came faster
     than they were counted here, and ``missed`` the frames that the device itself lost, by
-    ``missed_before``; ``gaps_s`` are times between two arrivals [s].
+    ``missed_before``.
     """
 
     messages: int = 0
@@ -218,7 +218,11 @@ class StreamRate:
     overflow: int = 0
     rejected: int = 0
     missed: int = 0
-    gaps_s: list[float] = field(default_factory=list)
+    _gaps: int = 0  # between two arrivals; of them mean, sum of squared deviations, and range [s]
+    _mean_s: float = 0.0
+    _squares_s2: float = 0.0
+    _min_s: float = float("inf")
+    _max_s: float = 0.0
     _arrival_ns: int = 0
     _holes: Holes = field(default_factory=Holes)
 
@@ -227,7 +231,7 @@ class StreamRate:
         self.messages += 1
         self.bytes += len(sample.payload)
         if self._arrival_ns:
-            self.gaps_s.append((sample.received_monotonic_ns - self._arrival_ns) * 1e-9)
+            self._add_gap((sample.received_monotonic_ns - self._arrival_ns) * 1e-9)
         self._arrival_ns = sample.received_monotonic_ns
         self.overflow = sample.lost_here
         try:
@@ -244,16 +248,24 @@ class StreamRate:
             )
         self.missed += stamp.missed_before
 
+    def _add_gap(self, gap_s: float) -> None:
+        """Welford's sums: all gaps of a command that is left on would fill the memory."""
+        self._gaps += 1
+        off_s = gap_s - self._mean_s
+        self._mean_s += off_s / self._gaps
+        self._squares_s2 += off_s * (gap_s - self._mean_s)
+        self._min_s, self._max_s = min(self._min_s, gap_s), max(self._max_s, gap_s)
+
     def summary(self) -> dict[str, float | int | None]:
         """The numbers to print; None where they need two messages and there is one."""
-        total_s = sum(self.gaps_s)
-        some = bool(self.gaps_s) and total_s > 0
+        total_s = self._gaps * self._mean_s
+        some = total_s > 0
         return {
             "messages": self.messages,
-            "rate_hz": len(self.gaps_s) / total_s if some else None,
-            "min_s": min(self.gaps_s) if some else None,
-            "max_s": max(self.gaps_s) if some else None,
-            "std_s": statistics.pstdev(self.gaps_s) if some else None,
+            "rate_hz": self._gaps / total_s if some else None,
+            "min_s": self._min_s if some else None,
+            "max_s": self._max_s if some else None,
+            "std_s": math.sqrt(self._squares_s2 / self._gaps) if some else None,
             "bytes_per_s": self.bytes / total_s if some else None,
             "lost": self.lost,
             "overflow": self.overflow,

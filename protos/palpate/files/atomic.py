@@ -25,7 +25,9 @@ def written_whole(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
+        _sync(partial)
         os.replace(partial, path)
+        sync_folder(path.parent)
     except PalpateError:  # some are OSErrors, too, of what the block read
         raise
     except OSError as error:
@@ -46,6 +48,17 @@ def write_synced(path: Path, content: bytes) -> None:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
+
+
+def _sync(path: Path) -> None:
+    """Bring a file, or a folder and all in it, to the disk."""
+    if path.is_dir():
+        for one in path.iterdir():
+            _sync(one)
+        sync_folder(path)
+    else:
+        with open(path, "rb") as file:
+            os.fsync(file.fileno())
 
 
 def sync_folder(folder: Path) -> None:

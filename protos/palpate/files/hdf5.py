@@ -67,7 +67,12 @@ class Hdf5Schema:
                 f"{where}: schema is {found or 'not stated'!r}, expected {self.name!r}",
                 remedy=self.remedy,
             )
-        number = int(file.attrs.get("schema_version", 0))
+        try:
+            number = int(file.attrs.get("schema_version", 0))
+        except (TypeError, ValueError, OverflowError) as error:
+            raise DatasetError(
+                f"{where}: attribute schema_version is no whole number", remedy=self.remedy
+            ) from error
         if number != self.version:
             raise DatasetError(
                 f"{where}: schema version {number}, this palpate reads {self.version}",

@@ -31,11 +31,9 @@ CHUNK_BYTES_MAX = 32 << 20
 CHANNELS_MAX = 4096
 """Channels, and schemas, of a file: twenty for each of two hundred sensors."""
 
-SUMMARY_BYTES_MAX = 32 << 20
-
 _FREE_BYTES = 64 << 20
-_RATIO_MAX = 400  # of untouched fields, which are zeros; measured data expand to three times
-_MESSAGE_COST = 256  # bytes; an empty message takes time, too
+_RATIO_MAX = 4000  # true fields of an untouched finger, which are zeros: 1000; measured data: 3
+_MESSAGE_COST = 2560  # bytes; an empty message takes time, too. The index alone has 16 for each
 
 _BYTES_MAX = {
     Opcode.HEADER: 64 << 10,
@@ -52,11 +50,13 @@ _BYTES_MAX = {
 
 _MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
+_LENGTH = struct.Struct("<Q")
 _MESSAGE = struct.Struct("<HIQQ")
 _TIME_MAX_NS = 2**63  # the year 2262; later ones do not fit the arrays of times
 _END_BYTES = _HEAD.size + 20 + len(_MAGIC)  # footer and magic
 _PASSED_OVER_MAX = CHUNK_BYTES_MAX  # of one record, where a file is known to be damaged [bytes]
 _PACKED_CHUNK = re.compile(rb"\x06.{36}(?:\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4)", re.DOTALL)
+_CHUNK_FIELDS_BYTES = 28 + 4 + 8  # beside its compression's name and its data
 _CHUNK_HEAD_BYTES = _HEAD.size + 28 + 8  # as far as the expression looks
 _LOOK_FIRST, _LOOK_BYTES = 1 << 12, 1 << 20
 _LOOK_MAX = 1 << 30  # how far the next chunk behind a damage is looked for [bytes]
@@ -129,6 +129,9 @@ def parts_of(file: IO[bytes], on_damage: OnDamage | None = None) -> Iterator[Par
         if opcode == Opcode.STATISTICS and on_damage is None:
             budget.compare(Statistics.read(ReadDataStream(BytesIO(data))))
         try:
+            if on_damage is not None and opcode == Opcode.MESSAGE and budget.chunks:
+                # Else a flipped bit makes a message of an index.
+                raise ValueError(f"a message at byte {at:,} stands outside of the chunks")
             yield from _parts(opcode, data, at, budget)
         except DAMAGED as error:
             if on_damage is None or isinstance(error, _BoundError):
@@ -177,11 +180,12 @@ def check_summary(file: IO[bytes]) -> None:
     start = footer.summary_start
     if not len(_MAGIC) < start < size - _END_BYTES:
         raise ValueError("it has no summary")
-    if size - start > SUMMARY_BYTES_MAX:
-        raise ValueError(f"its summary has {size - start:,} bytes")
     file.seek(start)
-    summed = file.read(size - len(_MAGIC) - 4 - start)  # the sum is what follows
-    if footer.summary_crc not in (0, zlib.crc32(summed)):
+    # Of a record of hours it has tens of megabytes; its sum is what follows.
+    left, crc = size - len(_MAGIC) - 4 - start, 0
+    while left > 0 and (block := file.read(min(left, _LOOK_BYTES))):
+        left, crc = left - len(block), zlib.crc32(block, crc)
+    if footer.summary_crc not in (0, crc):
         raise ValueError(f"the checksum of its index, from byte {start:,}, is wrong")
     file.seek(start)
     statistics: Statistics | None = None
@@ -278,22 +282,32 @@ def _record(
     if len(head) < _HEAD.size:
         raise EOFError("the end is missing")
     opcode, size = _HEAD.unpack(head)
-    if on_damage is not None and opcode != Opcode.CHUNK and _looks_like_chunk(file, head):
-        on_damage(Damage(at, 1, f"the chunk at byte {at:,} says that it is of kind {opcode}"))
-        opcode = Opcode.CHUNK
+    inner = None if on_damage is None else _inner_size(file, head)
+    agree = inner == size
+    if on_damage is not None and inner is not None:
+        if opcode != Opcode.CHUNK:
+            on_damage(Damage(at, 1, f"the chunk at byte {at:,} says that it is of kind {opcode}"))
+            opcode = Opcode.CHUNK
+        if not agree:
+            on_damage(Damage(at, 1, f"the chunk at byte {at:,} says two lengths"))
+            size = inner
     if opcode == 0:
         raise ValueError(f"there is no record at byte {at:,}")
     most = _BYTES_MAX.get(opcode)
+    allowed = most or (file_bytes if on_damage is None else _PASSED_OVER_MAX)
+    if size > allowed:
+        raise ValueError(
+            f"the record at byte {at:,} says that it has {size:,} bytes, {allowed:,} are allowed"
+        )
+    if on_damage is not None and not agree:
+        # Each head of a chunk is looked at, or one wrong length would hide good chunks.
+        if _next_chunk(file, at + 1, at + _HEAD.size + size) is not None:
+            raise ValueError(f"the record at byte {at:,} reaches over a chunk by its length")
+        file.seek(at + _HEAD.size)
     if most is None:
-        if size > (file_bytes if on_damage is None else _PASSED_OVER_MAX):
-            raise ValueError(f"the record at byte {at:,} says that it has {size:,} bytes")
         # Attachments and indices; to read them would take as long as they say they are.
         file.seek(size, os.SEEK_CUR)
         return None
-    if size > most:
-        raise ValueError(
-            f"the record at byte {at:,} says that it has {size:,} bytes, {most:,} are allowed"
-        )
     # Else thousands of heads that say so would each have the rest of the file read.
     data = file.read(size) if size <= file_bytes - at else b""
     if len(data) < size:
@@ -301,23 +315,31 @@ def _record(
     return opcode, data
 
 
-def _looks_like_chunk(file: IO[bytes], head: bytes) -> bool:
-    """Whether the record of this head has the begin of a packed chunk, whatever its kind."""
+def _inner_size(file: IO[bytes], head: bytes) -> int | None:
+    """Bytes of a record that begins as a packed chunk, whatever its head says; None = of another.
+
+    They follow from the length of the packed data.
+    """
     at = file.tell()
-    begin = head[1:] + file.read(_CHUNK_HEAD_BYTES - len(head))
+    begin = b"\x06" + head[1:] + file.read(_CHUNK_HEAD_BYTES + _LENGTH.size - len(head))
     file.seek(at)
-    return _PACKED_CHUNK.match(b"\x06" + begin) is not None
+    found = _PACKED_CHUNK.match(begin)
+    if found is None or len(begin) < found.end() + _LENGTH.size:
+        return None
+    (packed,) = _LENGTH.unpack_from(begin, found.end())
+    return found.end() + _LENGTH.size - _HEAD.size + int(packed)
 
 
-def _next_chunk(file: IO[bytes], start: int) -> int | None:
+def _next_chunk(file: IO[bytes], start: int, end: int | None = None) -> int | None:
     """Where the next packed chunk begins by its looks; whether it is one, its checksum tells."""
     kept, at, step = b"", start, _LOOK_FIRST
+    end = start + _LOOK_MAX if end is None else end
     file.seek(start)
-    while at - start < _LOOK_MAX and (block := file.read(step)):
+    while at < end and (block := file.read(min(step, end + _CHUNK_HEAD_BYTES - at))):
         data, step = kept + block, min(2 * step, _LOOK_BYTES)
         for found in _PACKED_CHUNK.finditer(data):
             _, size = _HEAD.unpack_from(data, found.start())
-            if size <= CHUNK_BYTES_MAX:
+            if size <= CHUNK_BYTES_MAX and at + found.start() < end:
                 return at + found.start()
         kept = data[-64:]  # the head of a chunk may lie across two blocks
         at += len(data) - len(kept)
@@ -331,6 +353,8 @@ def _chunk(data: bytes, at: int) -> Chunk:
             f"the chunk at byte {at:,} says that it expands to {chunk.uncompressed_size:,} bytes, "
             f"{CHUNK_BYTES_MAX:,} are allowed"
         )
+    if _CHUNK_FIELDS_BYTES + len(chunk.compression) + len(chunk.data) != len(data):
+        raise ValueError(f"the chunk at byte {at:,} says two lengths")
     return chunk
 
 

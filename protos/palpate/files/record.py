@@ -386,14 +386,16 @@ def is_being_written(part: Path) -> bool:
     """Whether the writer of a part is alive: it holds a lock, which ends with its process.
 
     Raises:
-        RecordingError: The part cannot be opened.
+        RecordingError: The part cannot be opened, or is no regular file.
     """
     try:
-        with open(part, "rb") as file:
+        with open_regular(part) as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 return True
+    except ValueError as error:
+        raise RecordingError(f"{part}: {error}", remedy="check the path") from error
     except OSError as error:
         raise RecordingError(
             f"{part} cannot be opened: {error.strerror or error}", remedy="check the path"
@@ -436,11 +438,12 @@ def recover(part: Path) -> Recovery:
     """Write the whole messages of a cut-off or damaged record to ``NAME.recovered.mcap``.
 
     A ``NAME.mcap.part`` of which only the end is missing is removed; one that is damaged otherwise
-    becomes ``NAME.mcap.damaged``. A file of another name stays as it is.
+    becomes ``NAME.mcap.damaged``. A file of another name stays as it is. After an error nothing of
+    the new record is left.
 
     Raises:
-        RecordingError: It is still being written, it is whole, nothing in it can be read, or there
-            is another file of the new record's name.
+        RecordingError: It is still being written, it is whole, nothing in it can be read, the disk
+            refuses the new record, or there is another file of its name.
     """
     if is_being_written(part):
         raise RecordingError(
@@ -476,10 +479,9 @@ def recover(part: Path) -> Recovery:
         raise RecordingError(
             f"{part} holds no whole message", remedy="there is nothing to recover; delete it"
         )
-    killed = target.with_name(f"{target.name}.part")  # an earlier recovery: its source is all there
-    if killed.exists() and not is_being_written(killed):
-        killed.unlink()
-    with RecordWriter(target, facts) as writer:
+    _remove_half(target)  # of an earlier recovery that was killed
+    writer = RecordWriter(target, facts)
+    try:
         for item in itertools.chain((first,), items):
             writer.write(
                 item.key,
@@ -489,6 +491,12 @@ def recover(part: Path) -> Recovery:
                 publish_time_ns=item.publish_time_ns,
                 sequence=item.sequence,
             )
+        writer.close()
+    except BaseException:
+        writer.abandon()
+        with contextlib.suppress(OSError):
+            _remove_half(target)  # it would keep a full disk full
+        raise
     original: Path | None = part
     if unfinished and not places:
         part.unlink()
@@ -498,6 +506,13 @@ def recover(part: Path) -> Recovery:
         if not aside.exists():
             original = part.rename(aside)
     return Recovery(target, original, places, left_out, first_damage)
+
+
+def _remove_half(target: Path) -> None:
+    """Remove a recovery that did not come to its end: its source is all there."""
+    half = target.with_name(f"{target.name}.part")
+    if half.exists() and not is_being_written(half):
+        half.unlink()
 
 
 def _is_whole(path: Path) -> bool:

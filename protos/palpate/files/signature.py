@@ -65,13 +65,14 @@ def sign_bundle(bundle: Bundle, key: Path) -> Path:
         ConfigError: The key cannot be read, or the folder cannot be written.
     """
     require("cryptography", extra="security")
+    from cryptography.exceptions import UnsupportedAlgorithm
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
     text = _read_key(key)
     try:
         loaded = load_pem_private_key(text, password=None)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, UnsupportedAlgorithm):
         loaded = None
     if not isinstance(loaded, Ed25519PrivateKey):
         raise ConfigError(
@@ -136,13 +137,14 @@ class TrustedKeys:
 
 def _public_key(path: Path) -> Ed25519PublicKey:
     require("cryptography", extra="security")
+    from cryptography.exceptions import UnsupportedAlgorithm
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
     from cryptography.hazmat.primitives.serialization import load_pem_public_key
 
     text = _read_key(path)
     try:
         key = load_pem_public_key(text)
-    except ValueError:
+    except (ValueError, UnsupportedAlgorithm):
         key = None
     if not isinstance(key, Ed25519PublicKey):
         raise ConfigError(

@@ -15,10 +15,7 @@ import hashlib
 import io
 import json
 import math
-import os
-import struct
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +25,7 @@ import numpy.typing as npt
 
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.atomic import written_whole
+from palpate.files.bounded import arrays_of_npz, open_regular
 from palpate.messages import FloatArray
 
 Array = npt.NDArray[np.float64]
@@ -311,8 +309,7 @@ _KEYS = {
     "fingers", "trajectories", "sha256",
 }  # fmt: skip
 _FILE_BYTES_MAX = 64 << 20
-_MEMBER_BYTES_MAX = 256 << 20
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_ARRAYS_BYTES_MAX = 256 << 20
 _AGAIN = "copy it again from where it was made, or build it again"
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -346,8 +343,6 @@ def write_tape(path: Path, tape: Tape) -> bytes:
                 buffer = io.BytesIO()
                 np.lib.format.write_array(buffer, array, allow_pickle=False)
                 archive.writestr(member, buffer.getvalue())
-        file.flush()
-        os.fsync(file.fileno())
     return bytes.fromhex(header["sha256"])
 
 
@@ -355,22 +350,26 @@ def read_tape(path: Path) -> Tape:
     """Read a tape and check every byte of it.
 
     Raises:
-        ConfigError: There is no such file.
+        ConfigError: There is no such file, or it is no regular one.
         DatasetError: It is no tape, damaged, or of a schema that this palpate does not know; names
             the file and what is wrong.
     """
     try:
-        if path.stat().st_size > _FILE_BYTES_MAX:
-            raise DatasetError(
-                f"{path} exceeds {_FILE_BYTES_MAX >> 20} MiB: no tape", remedy="give a tape"
-            )
-        data = path.read_bytes()
-    except OSError as error:
+        with open_regular(path) as file:
+            data = file.read(_FILE_BYTES_MAX + 1)
+    except (OSError, ValueError) as error:
         raise ConfigError(
-            f"the tape {path} cannot be read: {error.strerror or error}",
+            f"the tape {path} cannot be read: {getattr(error, 'strerror', None) or error}",
             remedy="give the path of a tape, NAME.npz",
         ) from error
-    members = _members(data, path)
+    if len(data) > _FILE_BYTES_MAX:
+        raise DatasetError(
+            f"{path} exceeds {_FILE_BYTES_MAX >> 20} MiB: no tape", remedy="give a tape"
+        )
+    try:
+        members = arrays_of_npz(data, _ARRAYS_BYTES_MAX)
+    except ValueError as error:
+        raise DatasetError(f"{path} is no tape or damaged: {error}", remedy=_AGAIN) from error
     header = _header(members.pop(_HEADER, None), path)
     if members.keys() != UNITS.keys():
         odd = sorted(members.keys() ^ UNITS.keys())
@@ -383,27 +382,6 @@ def read_tape(path: Path) -> Tape:
         raise DatasetError(f"{path} is no tape: {error!r}", remedy=_AGAIN) from error
     check_tape(tape, where=str(path))
     return tape
-
-
-def _members(data: bytes, path: Path) -> Arrays:
-    """All arrays of the archive; each is checked against its CRC before it is looked at."""
-    arrays: Arrays = {}
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            for member in archive.infolist():
-                name = member.filename.removesuffix(".npy")
-                if member.compress_type not in _METHODS or member.file_size > _MEMBER_BYTES_MAX:
-                    raise ValueError(f"member {name!r} is packed in an unknown way or too large")
-                if name in arrays:
-                    raise ValueError(f"member {name!r} is there twice")
-                buffer = io.BytesIO(archive.read(member))
-                arrays[name] = np.lib.format.read_array(buffer, allow_pickle=False)
-    except (
-        zipfile.BadZipFile, zlib.error, struct.error, ValueError, OSError, EOFError, KeyError,
-        NotImplementedError, RuntimeError, OverflowError, MemoryError,
-    ) as error:  # fmt: skip  # all that a damaged archive makes zipfile and NumPy raise
-        raise DatasetError(f"{path} is no tape or damaged: {error}", remedy=_AGAIN) from error
-    return arrays
 
 
 def _header(array: npt.NDArray[Any] | None, path: Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from palpate.clock import EARLIEST_WALL_S
 from palpate.errors import RecordingError
 from palpate.files.record import is_being_written, metadata_of
 from palpate.health import Health
@@ -66,6 +67,7 @@ class Retention:
         self._mine: dict[tuple[str, int], bool] = {}  # by name and inode: files never change
         # Those that were closed at the first look; and when each other one was first seen closed
         # (steady, s): the wall clock by which it was written may have been put right since then.
+        # Also of one whose time cannot be: it was written before the clock was set.
         self._earlier: set[tuple[str, int]] = set()
         self._closed_s: dict[tuple[str, int], float] = {}
         self._looked = False
@@ -134,7 +136,7 @@ class Retention:
                 if path.suffix == ".part" and is_being_written(path):
                     self._earlier.discard(key)
                     continue
-                if key not in self._earlier:
+                if key not in self._earlier or status.st_mtime < EARLIEST_WALL_S:
                     self._closed_s.setdefault(key, steady_s)
                 if key not in self._mine:
                     self._mine[key] = metadata_of(path).get(FACT) == OLDEST_FIRST

@@ -99,7 +99,7 @@ def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> l
         try:
             # A recovery that was itself killed, its source is still there; or a recorder that was
             # killed before its first write was whole.
-            if part.name.endswith(f"{RECOVERED}{PART}") or part.stat().st_size < _HEAD_BYTES:
+            if _is_half(part) or part.stat().st_size < _HEAD_BYTES:
                 part.unlink(missing_ok=True)
             else:
                 done.append(recover(part))
@@ -108,15 +108,23 @@ def recover_all(parts: Iterable[Path], stop: threading.Event | None = None) -> l
     return done
 
 
+def _is_half(part: Path) -> bool:
+    """Whether it is a recovery that did not come to its end."""
+    return part.name.endswith(f"{RECOVERED}{PART}")
+
+
 class RecordRecovery:
     """Recovers leftovers in a thread, because a large one must not delay the new record.
 
+    One of which the disk has no room for a copy waits: the copy would make the recorder pause.
     Counts ``recovered_records``, and those of them that were damaged: ``damaged_records``.
     """
 
-    def __init__(self, folder: Path, health: Health) -> None:
+    def __init__(self, folder: Path, health: Health, min_free_bytes: int) -> None:
         self._folder = folder
         self._health = health
+        self._min_free_bytes = min_free_bytes
+        self._waiting: list[Path] = []
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -127,11 +135,17 @@ class RecordRecovery:
         # Looked up before the thread starts: the new record that the caller opens after this call
         # must not be taken for a leftover.
         parts = leftovers(self._folder)
+        self._waiting = []
         if parts:
             self._thread = threading.Thread(
                 target=self._run, args=(parts,), name="recovery", daemon=True
             )
             self._thread.start()
+
+    def resume(self) -> None:
+        """Start again, if there is room now for one that waits."""
+        if any(part.exists() and self._has_room(part) for part in self._waiting):
+            self.start()
 
     def stop(self) -> None:
         """Stop after the present file; after two seconds it is left for the next start."""
@@ -140,11 +154,23 @@ class RecordRecovery:
             self._thread.join(timeout=2.0)
 
     def _run(self, parts: list[Path]) -> None:
-        for found in recover_all(parts, self._stop):
-            _log.log(logging.WARNING if found.places else logging.INFO, "recovered %s", found)
-            self._health.count("recovered_records", 1)
-            if found.places:
-                self._health.count("damaged_records", 1)
+        for part in sorted(parts, key=_is_half, reverse=True):  # those are removed: it gives room
+            if not (_is_half(part) or self._has_room(part)):
+                _log.warning("%s waits to be recovered until there is room for a copy", part)
+                self._waiting.append(part)
+                continue
+            for found in recover_all([part], self._stop):
+                _log.log(logging.WARNING if found.places else logging.INFO, "recovered %s", found)
+                self._health.count("recovered_records", 1)
+                if found.places:
+                    self._health.count("damaged_records", 1)
+
+    def _has_room(self, part: Path) -> bool:
+        """Whether the disk has room for a copy, and for the recorder; True if it cannot be said."""
+        try:
+            return free_bytes(self._folder) >= part.stat().st_size + self._min_free_bytes
+        except OSError:
+            return True
 
 
 def _alive(part: Path) -> bool:
@@ -228,7 +254,7 @@ class RecordFiles:
         self._tried_s = float("-inf")
         self._told = False  # of the present trouble with the disk
         self._says_ready = False
-        self._recovery = RecordRecovery(config.out, health)
+        self._recovery = RecordRecovery(config.out, health, config.min_free_bytes)
         MeshLibrary(config.bundles)  # raises for one that is missing, which a view would only log
         self._retention = retention.Retention(config, station, health)
         self._kept_s = float("-inf")
@@ -370,7 +396,10 @@ class RecordFiles:
         self.report()
 
     def _keep(self, now_s: float) -> None:
-        """Remove old records, within what the present one has left of the room."""
+        """Remove old records, within what the present one has left of the room.
+
+        Then recover those that waited for room.
+        """
         self._kept_s = now_s
         present = 0
         if self._writer is not None:
@@ -378,6 +407,7 @@ class RecordFiles:
             with contextlib.suppress(OSError):  # a view is there after its first update, if at all
                 present += self._writer.path.with_suffix(".rrd").stat().st_size
         self._retention.apply(present)
+        self._recovery.resume()
 
     def report(self) -> None:
         """Hand the counters to health."""
