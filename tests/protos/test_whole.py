@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -55,7 +57,12 @@ def test_what_gets_its_name_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.M
     steps: list[int | str] = []
     monkeypatch.setattr(os, "fsync", lambda number: steps.append(os.fstat(number).st_ino))
     replace = os.replace
-    monkeypatch.setattr(os, "replace", lambda *paths: (steps.append("named"), replace(*paths)))
+
+    def rename(old: Path, new: Path) -> None:
+        steps.append("named")
+        replace(old, new)
+
+    monkeypatch.setattr(os, "replace", rename)
     with written_whole(tmp_path / "file") as partial:
         partial.write_text("whole", encoding="utf-8")
     assert steps == [(tmp_path / "file").stat().st_ino, "named", tmp_path.stat().st_ino]
@@ -67,6 +74,24 @@ def test_what_gets_its_name_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.M
     all_of_it = {path.stat().st_ino for path in (folder, *folder.rglob("*"))}
     assert set(steps[:-2]) == all_of_it
     assert steps[-2:] == ["named", tmp_path.stat().st_ino]
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.EIO])
+def test_a_file_system_that_syncs_no_folder_is_no_trouble(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def sync(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", sync)
+    if number == errno.EIO:
+        with pytest.raises(DatasetError), written_whole(tmp_path / "file") as partial:
+            partial.write_text("whole", encoding="utf-8")
+        return
+    with written_whole(tmp_path / "file") as partial:
+        partial.write_text("whole", encoding="utf-8")
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "whole"
 
 
 def test_a_disk_that_refuses_is_named(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from palpate.files.record_writer import RecordWriter
 from palpate.health import Health
 from palpate.messages import NO_TARE, ElectrodeFrame, ServiceState, Tare
 from palpate_services.config import RecorderConfig
+from palpate_services.recorder import retention as retention_module
 from palpate_services.recorder import writer as writer_module
 from palpate_services.recorder.writer import FindTare, RecordFiles, leftovers, recover_all
 from palpate_services.viewer.live_view import LiveView, ViewPlan
@@ -546,7 +547,7 @@ def test_a_recovery_waits_until_there_is_room_for_a_copy(
     half.write_bytes(bytes(600))
     free = [10**8 + 10**5]
     monkeypatch.setattr(writer_module, "CHECK_S", 0.0)
-    monkeypatch.setattr(writer_module.retention, "CHECK_S", 0.0)
+    monkeypatch.setattr(retention_module, "CHECK_S", 0.0)
     monkeypatch.setattr(writer_module, "free_bytes", lambda _: free[0])
     with open_files(min_free_bytes=10**8) as (files, health):
         until(lambda: not half.exists())
