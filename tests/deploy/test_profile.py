@@ -137,6 +137,9 @@ def test_all_addresses_and_one_of_them_exclude_each_other(tmp_path: Path) -> Non
         load_profile(_write(tmp_path, text))
     assert "leave the other one out" in caught.value.remedy
     load_profile(_write(tmp_path, text.replace("0.0.0.0:7447", "192.168.1.2:7447")))
+    load_profile(_write(tmp_path, text.replace("127.0.0.1:7447", "[::1]:7447")))
+    with pytest.raises(ConfigError, match="at ::, which is all addresses"):
+        load_profile(_write(tmp_path, text.replace("0.0.0.0:7447", "[::]:7447")))
 
 
 def test_router_port_is_said_once(tmp_path: Path) -> None:

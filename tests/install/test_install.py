@@ -544,7 +544,9 @@ def test_router_of_a_station_reaches_its_site(root: Path, tmp_path: Path, instal
     assert "IPAddressAllow=localhost 192.168.1.2" in (root / UNIT).read_text("utf-8")
     (tmp_path / "lab.toml").write_text(text.replace("192.168.1.2", "site.lab"))
     with pytest.raises(ConfigError, match=r"'site\.lab' is a name"):
-        install(tmp_path / "lab.toml")
+        install(tmp_path / "lab.toml", name="other")
+    install(tmp_path / "lab.toml", allowed=("10.0.0.0/8",))
+    assert "IPAddressAllow=localhost 10.0.0.0/8" in (root / UNIT).read_text("utf-8")
 
 
 def test_certificates_by_role_are_handed_over_by_systemd(

@@ -165,3 +165,11 @@ def test_readings_that_are_kept_are_bounded_and_a_replay_begins_anew(stamp: Stam
     for at in (0, 1):
         matcher.add(wrench(later(stamp, at), 2.0))
     assert forces(matcher.add(estimate(later(stamp, 0.5)))) == [2.0]
+
+
+def test_a_pose_that_is_stamped_far_ahead_holds_up_no_estimate(stamp: Stamp) -> None:
+    """Of a robot on a host whose wall clock was set afterwards."""
+    matcher = TruthMatcher(remember=None)
+    matcher.add(pose(later(stamp, 1_000_000.0)))
+    matched = [match for message in press(stamp) for match in matcher.add(message)]
+    assert sum(one.estimate is not None and one.wrench is not None for one in matched) >= 24

@@ -134,7 +134,7 @@ def station_link(
 
     loaded = load_profile(profile)
     link = loaded.link
-    if tls is not None and not link.has_tls and connect is None and link.connect:
+    if tls is not None and not link.has_tls and connect is None and len(link.connect) == 1:
         connect = link.connect[0]  # as if it were given: whether the two fit is checked
     if tls is not None and link.has_tls:  # another role than the operator's, or another folder
         link = link.model_copy(update={"tls": TlsConfig.of_folder(tls), "certificates": None})

@@ -89,7 +89,11 @@ def needs_of(profile: Profile, allowed: Sequence[str] = ()) -> HostNeeds:
     }
     for table, endpoints in links.items():
         if table == "link" or table in profile.processes:
-            networks += _networks_of({table: list(endpoints)}, f"[{table}]")
+            try:
+                networks += _networks_of({table: list(endpoints)}, f"[{table}]")
+            except ConfigError:
+                if table != "router" or not allowed:  # which may be where the name leads
+                    raise
     _check_listeners(profile, networks)
     gpu = "fem" in profile.processes and profile.fem.device is not None
     return HostNeeds(

@@ -77,7 +77,8 @@ def names_taken(profile: Profile) -> Iterator[None]:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise LinkError(
-                    f"station {profile.station!r} runs already on this host: its {name}",
+                    f"station {profile.station!r} runs already on this host, or on another that "
+                    f"shares {folder}: its {name}",
                     remedy="look with `palpate status`, and stop it; or give this one another "
                     "name: station in the profile, or a spare's replica",
                 ) from error

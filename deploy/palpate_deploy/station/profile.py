@@ -407,7 +407,10 @@ def _check_router(profile: Profile, where: str) -> None:
             )
     own = {endpoint_host_port(endpoint) for endpoint in profile.router.listen}
     for host, port in sorted(own):
-        if host in ("0.0.0.0", "::") and sum(other == port for _, other in own) > 1:
+        # All addresses of IPv6 are those of IPv4, too.
+        same = [one for one, other in own - {(host, port)} if other == port]
+        excluded = [one for one in same if host == "::" or ":" not in one]
+        if host in ("0.0.0.0", "::") and excluded:
             raise ConfigError(
                 f"{where}: router.listen names port {port} at {host}, which is all addresses, and "
                 "at another one",

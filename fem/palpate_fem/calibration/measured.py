@@ -33,7 +33,6 @@ from palpate.files.hdf5 import (
 )
 from palpate.files.simulation_store import check_id
 from palpate_fem.arrays import Floats
-from palpate_fem.indenter.path import REACH_M
 
 INDENTATIONS = Hdf5Schema(
     "palpate.indentations",
@@ -64,8 +63,7 @@ class MeasuredIndentation:
         outcome: How it ended, if simulated (the words of ``result.IndentationOutcome``).
 
     Raises:
-        DatasetError: Shapes, NaN, no unit quaternion, positions that are not in metres, no
-            movement; names the trajectory.
+        DatasetError: Shapes, NaN, no unit quaternion, no movement; names the trajectory.
     """
 
     name: str
@@ -110,11 +108,6 @@ class MeasuredIndentation:
         lengths = np.linalg.norm(self.pose[:, 3:], axis=1)
         if np.abs(lengths - 1.0).max() > _UNIT_QUATERNION:
             return f"orientation is no unit quaternion in row {np.abs(lengths - 1.0).argmax()}"
-        far = np.abs(self.pose[:, :3]).max(axis=1)
-        if far.max() > REACH_M:
-            return (
-                f"row {far.argmax()} is {far.max():.3g} m away from the sensor, not in {REACH_M} m"
-            )
         if not np.ptp(self.pose[:, :3], axis=0).any():
             return "the indenter does not move"
         return ""

@@ -14,6 +14,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -117,11 +118,13 @@ class SimulationService(Closing):
                         remedy="choose another, e.g. uuid.uuid4().hex",
                     )
                 self._active[request.request_id] = active
-            outbox = EventOutbox(lambda event: self._pass_on(active, event))
+            outbox: EventOutbox | None = None
             try:
-                self.pool.submit(job, lambda event: self._on_event(active, outbox, event))
-            except PalpateError:
-                outbox.drop()
+                outbox = EventOutbox(lambda event: self._pass_on(active, event))
+                self.pool.submit(job, partial(self._on_event, active, outbox))
+            except BaseException:
+                if outbox is not None:
+                    outbox.drop()
                 self._forget(active)
                 raise
             with self._lock:

@@ -7,6 +7,7 @@ made elsewhere; this process keeps the claims and writes the files.
 from __future__ import annotations
 
 import itertools
+import math
 import threading
 
 import numpy as np
@@ -115,6 +116,8 @@ class PackingProcesses(Closing):
 
     def _on_made(self, child: ChildProcess, made: ImageMade) -> None:
         claim, _ = self._jobs[child][made.number]
+        with self._changed:  # what follows is the disk's time, and not the process's
+            self._turns[child].next(math.inf)
         try:
             with claim:
                 claim.commit(made.image.data)

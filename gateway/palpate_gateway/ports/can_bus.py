@@ -41,6 +41,9 @@ BioTacs."""
 
 _BY_ITSELF = "it is opened again by itself"
 
+_BAD_MOST = 100
+"""So many lines in a row that cannot be read are no damage of the line."""
+
 
 class CanBatch(NamedTuple):
     """Data frames, and their times of arrival by the host's monotonic clock [ns].
@@ -105,6 +108,7 @@ class CanBus:
         self._direct: tuple[Datagrams, Reader] | None = None
         self._stamps = KernelStamps()
         self._end: DeviceLost | None = None
+        self._bad_in_a_row = 0
         self.counters: dict[str, int] = dict.fromkeys(
             ("error_frames", "other_frames", "bad_lines"), 0
         )
@@ -135,7 +139,7 @@ class CanBus:
                 "check its name",
             ) from error
 
-        self._stamps, self._end = KernelStamps(), None
+        self._stamps, self._end, self._bad_in_a_row = KernelStamps(), None, 0
         self._direct = self._find_socket()
 
     def _find_socket(self) -> tuple[Datagrams, Reader] | None:
@@ -216,6 +220,9 @@ class CanBus:
             except (IndexError, ValueError):
                 # python-can's slcan cannot read a damaged line; the next one may be good.
                 self.counters["bad_lines"] += 1
+                self._bad_in_a_row += 1
+                if self._bad_in_a_row >= _BAD_MOST:
+                    self._end = self._lost("its driver cannot read what comes")
                 break
             except Exception as error:  # drivers raise whatever their library does
                 if not frames:
@@ -225,6 +232,7 @@ class CanBus:
                 break
             if message is None:
                 break
+            self._bad_in_a_row = 0
             now_ns = time.monotonic_ns()
             arrivals_ns.append(self._stamps.monotonic_ns(message.timestamp, now_ns))
             frames.append(from_message(message))

@@ -18,15 +18,18 @@ from palpate.config import Name
 from palpate.errors import RecordingError, WireError
 from palpate.files.record import RecordItem, only_name, read_record
 from palpate.messages import RobotPoseFrame
-from palpate_gateway.clock.envelope import ClockEnvelope
+from palpate_gateway.clock.envelope import SETTLED_S, ClockEnvelope
 from palpate_gateway.device import BusDevice, DeviceIdentity, FileDevice
 from palpate_gateway.pose.placement import Placement, PlacementOptions, within_reach
 from palpate_gateway.pose.table import PoseRow, PoseTable
 from palpate_gateway.pose.track import PoseTrack, PoseVerdict
 from palpate_gateway.readings import PoseReading
 
-_SET_NS = 5e8
-"""A line of delays that jumps by more is of a wall clock that was set [ns]."""
+_SET_NS = 5e7
+"""A delay, or a line of delays, that jumps by more is of a wall clock that was set [ns]."""
+
+_DRIFT = 1e-3
+"""Share of the time between two poses by which clocks can drift apart meanwhile."""
 
 
 class _RunClock:
@@ -41,19 +44,32 @@ class _RunClock:
         self._time_ns, self._wall_ns = first.time_ns, first.wall_ns or log_ns
         self._tells_wall = first.wall_ns > 0
         self._envelope = ClockEnvelope()
-        self._line_ns = self._set_ns = 0.0
+        self._robot_ns = self._delay_ns = self._set_ns = 0
+        self._line_ns = self._zero_ns = 0.0
 
     def elapsed_s(self, frame: RobotPoseFrame, log_ns: int) -> float:
         """Time of the next pose since the first [s]."""
         robot_ns = frame.time_ns - self._time_ns
         wall_ns = frame.wall_ns if self._tells_wall else log_ns
         if wall_ns:
-            self._envelope.add(robot_ns * 1e-9, wall_ns - self._wall_ns - robot_ns)
+            self._envelope.add(robot_ns * 1e-9, self._delay(robot_ns, wall_ns))
         line_ns = self._envelope.at(robot_ns * 1e-9)
-        if abs(line_ns - self._line_ns) > _SET_NS:
-            self._set_ns += line_ns - self._line_ns
-        self._line_ns = line_ns
-        return (robot_ns + line_ns - self._set_ns) * 1e-9
+        moved_ns, self._line_ns = line_ns - self._line_ns, line_ns
+        # How late the first poses came is no drift either.
+        if robot_ns * 1e-9 < SETTLED_S or abs(moved_ns) > _SET_NS:
+            self._zero_ns += moved_ns
+        return (robot_ns + line_ns - self._zero_ns) * 1e-9
+
+    def _delay(self, robot_ns: int, wall_ns: int) -> int:
+        """How much later than the first pose this one is by the wall clock than by its own [ns]."""
+        delay_ns = wall_ns - self._wall_ns - robot_ns - self._set_ns
+        jump_ns = delay_ns - self._delay_ns
+        apart_ns = _SET_NS + _DRIFT * (robot_ns - self._robot_ns)
+        if self._tells_wall and abs(jump_ns) > apart_ns:  # the bus delays others by more
+            self._set_ns += jump_ns
+            delay_ns -= jump_ns
+        self._robot_ns, self._delay_ns = robot_ns, delay_ns
+        return delay_ns
 
 
 class RecordedPoses:

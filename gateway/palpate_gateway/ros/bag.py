@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 import logging
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 from dataclasses import replace
 from itertools import islice
@@ -35,6 +36,9 @@ _LOOK = 20
 
 _BEGAN_ANEW = 10
 """So many messages in a row with an earlier time show that the clock of ROS was set back."""
+
+_FALLS, _AMONG = 3, 20
+"""So many numbers that go back, among so many messages, show that the messages are mixed."""
 
 
 class RosBagOptions(RosFingerOptions):
@@ -91,33 +95,39 @@ def _onward(
     before: _Timed[_Decoded] | None = None
     last: _Timed[_Decoded] | None = None  # held back until the next one shows that it is right
     earlier: list[_Timed[_Decoded]] = []
-    for told in messages:
-        one = told._replace(time_ns=told.time_ns + shift_ns)
-        if last is None or one.time_ns >= last.time_ns:
-            if last is not None:
+    damage: RecordingError | None = None
+    try:
+        for told in messages:
+            one = told._replace(time_ns=told.time_ns + shift_ns)
+            if last is None or one.time_ns >= last.time_ns:
+                if last is not None:
+                    yield last
+                yield from earlier
+                before, last, earlier = last, one, []
+                continue
+            earlier.append(one)
+            if len(earlier) < _BEGAN_ANEW:
+                continue
+            if before is not None and earlier[0].time_ns > before.time_ns:
+                counts["early_messages"] += 1
+            else:
+                counts["time_jumps"] += 1
                 yield last
-            yield from earlier
-            before, last, earlier = last, one, []
-            continue
-        earlier.append(one)
-        if len(earlier) < _BEGAN_ANEW:
-            continue
-        if before is not None and earlier[0].time_ns > before.time_ns:
-            counts["early_messages"] += 1
-        else:
-            counts["time_jumps"] += 1
-            yield last
-            # Only the recorder's clock spans both, also for the other topics of the bag.
-            gained_ns = max(earlier[0].recorded_ns - last.recorded_ns, 1)
-            back_ns = last.time_ns + gained_ns - earlier[0].time_ns
-            shift_ns += back_ns
-            earlier = [each._replace(time_ns=each.time_ns + back_ns) for each in earlier]
-        earlier.sort(key=lambda each: each.time_ns)
-        yield from earlier[:-1]
-        before, last, earlier = earlier[-2], earlier[-1], []
+                # Only the recorder's clock spans both, also for the other topics of the bag.
+                gained_ns = max(earlier[0].recorded_ns - last.recorded_ns, 1)
+                back_ns = last.time_ns + gained_ns - earlier[0].time_ns
+                shift_ns += back_ns
+                earlier = [each._replace(time_ns=each.time_ns + back_ns) for each in earlier]
+            earlier.sort(key=lambda each: each.time_ns)
+            yield from earlier[:-1]
+            before, last, earlier = earlier[-2], earlier[-1], []
+    except RecordingError as error:  # after what was held back
+        damage = error
     if last is not None:
         yield last
     yield from earlier
+    if damage is not None:
+        raise damage
 
 
 class RosBagFile:
@@ -332,14 +342,20 @@ class RosBag(FileDevice):
 
     def _fingers(self, bag: RosBagFile, topic: str) -> Iterator[ElectrodeReading]:
         before: int | None = None
-        for hand, time_ns, _ in _onward(self._hands(bag, topic), self._counts):
+        falls: deque[int] = deque(maxlen=_FALLS)
+        timed = _onward(self._hands(bag, topic), self._counts)
+        for number, (hand, time_ns, _) in enumerate(timed):
             # The header of ROS 1 has a number; drivers that do not fill it leave it at 0.
             now, lost = hand.sequence, None
             if before is not None and now is not None:
                 if now > before:
                     lost = now - before - 1
-                elif before > now > 1:  # no restart of the driver, which counts from 0 or 1
-                    self._disordered(bag, topic)
+                elif 0 < now < before:
+                    falls.append(number)
+                    # A driver that starts anew falls once, and two swapped messages once.
+                    if len(falls) == _FALLS and number - falls[0] < _AMONG:
+                        self._disordered(bag, topic)
+                        falls.clear()
             before = now
             reading = self._track.take(replace(hand, time_ns=time_ns), lost=lost)
             if reading is not None:

@@ -104,6 +104,9 @@ CHECK_S = 10.0
 _TOLERANCE = 0.03
 """Relative tolerance of the rate: products differ by more, late arrivals change it by less."""
 
+_COUNTS_MOST_HZ = 1e6
+"""No device counts faster [counts/s]; after a restart the counter seems to have gained far more."""
+
 _RESTART_S = 0.5
 """If the two clocks differ by more over a gap in the stream, the device was off [s]."""
 
@@ -153,7 +156,7 @@ class CounterClock:
     def _check_restart(self, gained: int, waited_s: float) -> None:
         if self._rate_hz is None:
             # After a restart far behind, the nearer way may be forwards: too far for the time.
-            went_on = 0 <= gained <= wire.LATE_COUNTS * (waited_s + _RESTART_S)
+            went_on = 0 <= gained <= _COUNTS_MOST_HZ * (waited_s + _RESTART_S)
         else:
             went_on = gained >= 0 and abs(gained / self._rate_hz - waited_s) <= _RESTART_S
         if not went_on:

@@ -304,6 +304,7 @@ def no_reply(
     one of the key.
     """
     served = known or is_served(session, key, LOOK_S)
+    lacks = "" if served else ", or it knows no such question"
     found: list[AliveService] = []
     if not served:
         with while_open():
@@ -312,13 +313,13 @@ def no_reply(
     if roles and served:
         return LinkError(
             f"{key} is served, but no answer arrived: the role of this certificate may not ask it, "
-            f"it ended while it worked on the question, or its answer is {_DROPPED}",
+            f"it ended while it worked on the question, or its answer is {_DROPPED}{lacks}",
             remedy="docs/security.md lists what each role may ask; palpate certs show tells yours",
         )
     if served:
         return LinkError(
             f"{key} is served, but no answer arrived: it ended while it worked on the question, "
-            f"or its answer is {_DROPPED}",
+            f"or its answer is {_DROPPED}{lacks}",
             remedy="ask again; if that fails, ask for less and look at the log of the service",
         )
     if others := other_stations(found, station):

@@ -67,7 +67,10 @@ def sync_folder(folder: Path) -> None:
 
     A file system that cannot, as some of a network, decides itself when it does.
     """
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except PermissionError:  # names may be written there, and not listed
+        return
     try:
         os.fsync(handle)
     except OSError as error:

@@ -309,7 +309,7 @@ _KEYS = {
     "fingers", "trajectories", "sha256",
 }  # fmt: skip
 _FILE_BYTES_MAX = 64 << 20
-_ARRAYS_BYTES_MAX = 256 << 20
+_ARRAYS_BYTES_MAX = 1 << 30
 _AGAIN = "copy it again from where it was made, or build it again"
 
 Arrays = dict[str, npt.NDArray[Any]]

@@ -124,15 +124,17 @@ _ERRORS: dict[EstimateRefusal, tuple[ErrorCode, str, str]] = {
 }
 
 
-_REFUSED_BY_ALL = frozenset(
+_REFUSED_HERE = frozenset(
     {
-        EstimateRefusal.UNTARED,
-        EstimateRefusal.WRONG_TARE,
-        EstimateRefusal.INVALID_CHANNELS,
-        EstimateRefusal.REPLAYED,
+        EstimateRefusal.STALE,
+        EstimateRefusal.CLOCK_SKEW,
+        EstimateRefusal.TARE_UNKNOWN,
+        EstimateRefusal.WRONG_SENSOR,
+        EstimateRefusal.WRONG_MESH,
+        EstimateRefusal.NO_MODEL,
     }
 )
-"""Reasons that lie in the message: no standby would answer it either."""
+"""Reasons of this process or its host; by another one, a standby would not answer either."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -401,7 +403,7 @@ class EstimatePublisher(Generic[M, E]):
                 self._exchanged = False
                 show(self._models, self._health)
             for sensor, reason in self._input.report().items():
-                if self._duty is not None and reason not in _REFUSED_BY_ALL:
+                if self._duty is not None and reason in _REFUSED_HERE:
                     self._duty.release(sensor)  # a standby may be able to
         period_ns = now_ns - self._gauged_ns
         if last or period_ns >= _GAUGE_PERIOD_NS:

@@ -123,7 +123,10 @@ class _Readings(Generic[Reading]):
         self._between: Callable[[Stamp, Reading, Reading, float], Reading] = between
         self._remember = remember
         self._kept: list[Reading] = []
-        self._waiting: deque[tuple[Stamp, MatchedMessages]] = deque(maxlen=remember)
+        # Of poses and of estimates (True), which may be stamped by clocks that are far apart.
+        self._waiting: dict[bool, deque[tuple[Stamp, MatchedMessages]]] = {
+            kind: deque(maxlen=remember) for kind in (False, True)
+        }
 
     def add(self, reading: Reading) -> list[tuple[MatchedMessages, Reading]]:
         """Keep a reading; returns matches that have waited for it, each with its truth."""
@@ -131,22 +134,24 @@ class _Readings(Generic[Reading]):
             last, now = self._kept[-1].stamp, reading.stamp
             if now.clock_id != last.clock_id or _apart_ns(now, last) < 0:
                 self._kept.clear()  # another host, or a record that is replayed again
-                self._waiting.clear()
+                for waiting in self._waiting.values():
+                    waiting.clear()
         self._kept.append(reading)
         if self._remember is not None and len(self._kept) > 2 * self._remember:
             del self._kept[: -self._remember]
         known = []
-        while self._waiting and _apart_ns(reading.stamp, self._waiting[0][0]) >= 0:
-            stamp, match = self._waiting.popleft()
-            if (truth := self._find(stamp)) is not None:
-                known.append((match, truth))
+        for waiting in self._waiting.values():
+            while waiting and _apart_ns(reading.stamp, waiting[0][0]) >= 0:
+                stamp, match = waiting.popleft()
+                if (truth := self._find(stamp)) is not None:
+                    known.append((match, truth))
         return known
 
     def at(self, stamp: Stamp, match: MatchedMessages) -> Reading | None:
         """The truth at an instant; where the stream has not come so far, the match waits for it."""
         truth = self._find(stamp)
         if truth is None and (not self._kept or _apart_ns(stamp, self._kept[-1].stamp) > 0):
-            self._waiting.append((stamp, match))
+            self._waiting[match.estimate is not None].append((stamp, match))
         return truth
 
     def _find(self, stamp: Stamp) -> Reading | None:

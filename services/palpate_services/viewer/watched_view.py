@@ -9,6 +9,7 @@ slow one holds up nobody.
 from __future__ import annotations
 
 import contextlib
+import math
 import secrets
 import threading
 import time
@@ -179,7 +180,8 @@ class WatchedView(Closing):
         self._view: LiveView | None = None
         self._ending: list[LiveView] = []
         self._chapter = 0
-        self._begun_s = float("-inf")
+        self._begun_s = -math.inf
+        self._lacks_room = False
         self._told: set[tuple[str, int]] = set()
         self._sensors: dict[str, int] = {}  # when it last sent, monotonic clock [ns]
         self._field_drawn_ns: dict[tuple[str, str], int] = {}
@@ -244,7 +246,9 @@ class WatchedView(Closing):
         self._begun_s = time.monotonic()
         self._told.clear()
         now_ns = time.monotonic_ns()
-        self._sensors = {name: ns for name, ns in self._sensors.items() if not _gone(ns, now_ns)}
+        if self._lacks_room:
+            alive = {name: ns for name, ns in self._sensors.items() if not _gone(ns, now_ns)}
+            self._sensors, self._lacks_room = alive, False
         shown = self.parts.contents
         plan = ViewPlan(
             None,
@@ -279,6 +283,7 @@ class WatchedView(Closing):
             self._counts["view_no_room"] += 1
             if any(_gone(last_ns, now_ns) for last_ns in self._sensors.values()):
                 self._end_chapter()  # the next one has room
+                self._lacks_room = True
             return
         stream = sample.sensor, sample.topic
         if sample.topic in _FIELDS:
@@ -299,6 +304,7 @@ class WatchedView(Closing):
         if not isinstance(message, Tare) and self._set_back(stream, message):
             # Viewers stay at the latest time of a recording: they get another one.
             self._end_chapter()
+            self._begun_s = -math.inf
             self.parts = KeptParts()
             self._wall_ns.clear()
             return

@@ -134,6 +134,34 @@ def test_a_wall_clock_that_was_set_while_it_recorded_moves_no_pose(
     np.testing.assert_allclose(steps_s, 0.25, atol=0.01)
 
 
+@pytest.mark.parametrize("step_s", [-0.4, -0.2, 0.2])
+def test_a_small_step_of_the_wall_clock_moves_no_pose(tmp_path: Path, step_s: float) -> None:
+    frames = [
+        fakes.frame(n, time_ns=10_000_000 * n, wall_ns=WALL_NS + 10_000_000 * n + shift)
+        for n in range(1, 3001)
+        for shift in [round(1e9 * step_s) * (n > 1000)]
+    ]
+    readings, _, _ = drain(write(tmp_path / "a.mcap", frames, period_ns=10_000_000))
+    np.testing.assert_allclose([one.time_s for one in readings], 0.01 * np.arange(3000), atol=1e-3)
+
+
+def test_a_first_pose_that_came_late_shortens_no_time(tmp_path: Path) -> None:
+    """Where poses tell no wall clock, the recorder's says how the robot's clock drifts."""
+    path = tmp_path / "a.mcap"
+    with RecordWriter(path) as writer:
+        for number in range(2000):
+            frame = fakes.frame(number + 1, time_ns=10_000_000 * (number + 1))
+            late_ns = max(0, 300_000_000 - 10_000_000 * number)  # a queue of the start
+            writer.write(
+                sensor_key("lab", frame.robot, ROBOT_POSE.name),
+                ROBOT_POSE.codec.schema,
+                ROBOT_POSE.codec.encode(frame),
+                log_time_ns=WALL_NS + 10_000_000 * number + late_ns,
+            )
+    readings, _, _ = drain(path)
+    np.testing.assert_allclose([one.time_s for one in readings], 0.01 * np.arange(2000), atol=1e-3)
+
+
 def test_one_of_several_robots(tmp_path: Path) -> None:
     frames = [fakes.frame(n, robot=robot) for n in range(1, 6) for robot in ("left", "right")]
     path = write(tmp_path / "a.mcap", frames)

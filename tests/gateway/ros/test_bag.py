@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from palpate.messages import Origin
 from palpate.ros.layouts import BIOTAC_ALL, BIOTAC_HAND, WRENCH_STAMPED, Dialect, encode
 from palpate_gateway.drivers import make_device
 from palpate_gateway.readings import ElectrodeReading, WrenchReading
+from palpate_gateway.ros.bag import RosBagFile
 
 PERIOD_NS = 10_000_000
 
@@ -151,6 +153,44 @@ def test_a_driver_that_was_started_again_is_no_jump(tmp_path: Path) -> None:
     readings, counters = readings_of(write_bag(tmp_path / "a.bag", messages, "ros1"))
     assert len(readings) == 20
     assert counters["time_jumps"] == 0
+
+
+@pytest.mark.parametrize(
+    "numbers", [[*range(100, 130), *range(7, 37)], [*range(1, 30), 31, 30, 32]]
+)
+def test_numbers_that_go_back_once_are_no_mixture(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, numbers: list[int]
+) -> None:
+    """A driver that was started again, of which the recorder missed the first; two swapped ones."""
+    messages = []
+    for k, number in enumerate(numbers):
+        at_ns = BEGAN_NS + PERIOD_NS * k
+        hand = encode(hand_fields(number, at_ns, "ros1"), BIOTAC_HAND, "ros1")
+        messages.append(("/hand", BIOTAC_HAND, at_ns, hand))
+    readings, counters = readings_of(write_bag(tmp_path / "a.bag", messages, "ros1"))
+    assert len(readings) == len(numbers)
+    assert counters["time_jumps"] == 0
+    assert "not in the order" not in caplog.text
+
+
+def test_all_readings_before_a_damage_are_delivered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = make_bag(tmp_path / "a.bag", 20)
+    whole = RosBagFile.messages
+
+    def messages(self: RosBagFile, topic: str) -> Iterator[tuple[bytes, int]]:
+        yield from itertools.islice(whole(self, topic), 10)
+        raise RecordingError("it is damaged here", remedy="none")
+
+    readings = []
+    with make_device("ros_bag", {"path": path}) as device:
+        monkeypatch.setattr(RosBagFile, "messages", messages)
+        while len(readings) < 10:
+            readings += device.read(1.0)
+        with pytest.raises(RecordingError, match="damaged here"):
+            device.read(1.0)
+    assert len(fingers(readings)) == 10
 
 
 @pytest.mark.parametrize("dialect", ["ros1", "cdr"])

@@ -487,7 +487,8 @@ def _check_values(data: FeatureDataset) -> None:
                     f"{data.name}: half of {name} is {away:.4g} m and more from the origin of the"
                     f" sensor frame; on a fingertip it is below {LOCATION_MOST_M:g} m",
                     remedy="give metres in the sensor frame (a table in mm says so in its column"
-                    " map: length_unit)",
+                    " map: length_unit); of a robot that is away for long, zero the force/torque"
+                    " sensor before, or the force says contact",
                 )
     check_rest(data.baseline, np.arange(len(data)), data.name)
     if data.contact_normal is not None:

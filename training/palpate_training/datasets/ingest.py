@@ -53,6 +53,9 @@ TOUCH_N = 0.2
 """Without a pose that knows contact, a force above this is contact [N]; it is above the noise of a
 6-axis sensor."""
 
+MANY_LEFT_OUT = 0.01
+"""A larger share of frames that are left out is told as a warning."""
+
 PRESS_N = 0.5
 """What does not reach this force is no press [N]."""
 
@@ -226,7 +229,9 @@ def _align(
             f" valid or with no tare in the record, {apart} with no {pair} within three periods"
         )
         notes.append(left_out)
-        _log.warning("%s: %s", path, left_out)
+        # A frame or two before the first force is no news.
+        many = unusable + apart > MANY_LEFT_OUT * len(streams.frames)
+        _log.log(logging.WARNING if many else logging.INFO, "%s: %s", path, left_out)
 
     baseline = np.array([streams.tares[frame.tare_id].electrodes for frame in frames])
     columns: dict[str, npt.NDArray[Any]] = {

@@ -115,7 +115,10 @@ def read_published(
             )
         digests[file.sha256] = file.path
     runs = [find_runs(str(f.path), f.force, f.location, f.indenter, f.trajectory) for f in files]
-    names = name_trajectories(runs)
+    # Ids of two exports are numbers that each gave by itself.
+    exports = {(f.provenance.source, f.provenance.input_sha256) for f in files}
+    named = len(exports) == 1 and all(file.trajectory is not None for file in files)
+    names = name_trajectories(runs, stated=named)
     trials = [
         _trial(f"biotac-{unit}", file, run, name)
         for unit, file, of_file, ids in zip(wanted, files, runs, names, strict=True)
@@ -124,7 +127,6 @@ def read_published(
     # An export of palpate's own says where it comes from; the publisher's files do not.
     sources = dict.fromkeys(f.provenance.source for f in files if f.provenance.source)
     licences = dict.fromkeys(f.provenance.licence for f in files if f.provenance.licence)
-    named = all(file.trajectory is not None for file in files)
     found = (
         "as the files name them"
         if named
@@ -435,10 +437,10 @@ def _run(rows: slice, indenter: str, tip: Floats, trajectory: str) -> PublishedR
     return PublishedRun(rows, indenter, tip[0], direction, travel_m, trajectory)
 
 
-def name_trajectories(units: list[list[PublishedRun]]) -> list[list[str]]:
+def name_trajectories(units: list[list[PublishedRun]], *, stated: bool = False) -> list[list[str]]:
     """Give the same id to runs of different BioTacs that are the same trajectory.
 
-    Where all files state ids, these are taken. Else such runs have the same indenter, begin in
+    Where ids are ``stated``, these are taken. Else such runs have the same indenter, begin in
     nearly the same place and go in nearly the same direction, which is not asked of a path that is
     too short to have one; each BioTac has a trajectory once, so they are assigned one to one. What
     is on one side only gets an id of its own.
@@ -446,7 +448,7 @@ def name_trajectories(units: list[list[PublishedRun]]) -> list[list[str]]:
     Returns:
         Stated ids, or ``<indenter>/<number>``, in the same order.
     """
-    if all(run.trajectory for runs in units for run in runs):
+    if stated:
         return [[run.trajectory for run in runs] for runs in units]
     assign = require("scipy.optimize", extra="training").linear_sum_assignment
     known: dict[str, list[PublishedRun]] = {}

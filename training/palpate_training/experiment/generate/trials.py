@@ -7,6 +7,7 @@ what is expensive to make (the specimens' electrodes) between tasks.
 from __future__ import annotations
 
 import io
+import logging
 import pickle
 import tempfile
 import threading
@@ -49,6 +50,8 @@ from palpate_training.experiment.plan import (
 from palpate_training.experiment.stand_in_arm import sensor_robot, stand_in_arm
 from palpate_training.experiment.virtual_testbed import contact_travel, perform
 
+_log = logging.getLogger(__name__)
+
 Floats = NDArray[np.float64]
 
 WARM_S = 1800.0
@@ -87,7 +90,6 @@ def make_trials(
             disk refuses.
     """
     fingertip = store.fingertip()
-    _keep_fingertip(folder, fingertip.key, store.path)
     there = set(store.ids())
     every: list[PlannedTrajectory | PlannedManipulation] = [
         *simulator.plans(spec, fingertip),
@@ -100,6 +102,7 @@ def make_trials(
     ]
     left = [(plan, who) for plan, who in plans if not file_of(folder, plan.trajectory).exists()]
     done = len(plans) - len(left)
+    _keep_fingertip(folder, fingertip.key, store.path, done=done, more=bool(left))
     on_progress(done, len(plans), "")
     if not left:
         return True
@@ -121,12 +124,19 @@ def make_trials(
     return done == len(plans)
 
 
-def _keep_fingertip(folder: Path, key: str, store: Path) -> None:
-    """Write of which fingertip the trials are, or compare it with what is there."""
+def _keep_fingertip(folder: Path, key: str, store: Path, *, done: int, more: bool) -> None:
+    """Write of which fingertip the trials are, if ``more`` come, or compare it with what is there.
+
+    ``done`` trajectories have trials already.
+    """
     path = folder / FINGERTIP
     try:
         found = path.read_bytes()
     except FileNotFoundError:
+        if not more:
+            return
+        if done:
+            _log.warning("%s does not say of which fingertip its %d trials are", folder, done)
         with written_whole(path) as part:
             part.write_text(key, encoding="utf-8")
         return
