@@ -183,7 +183,7 @@ def test_all_readings_before_a_damage_are_delivered(
         yield from itertools.islice(whole(self, topic), 10)
         raise RecordingError("it is damaged here", remedy="none")
 
-    readings = []
+    readings: list[Any] = []
     with make_device("ros_bag", {"path": path}) as device:
         monkeypatch.setattr(RosBagFile, "messages", messages)
         while len(readings) < 10:
