@@ -313,8 +313,11 @@ def wait_until() -> Callable[..., None]:
 
 @pytest.fixture
 def pair(link: LinkConfig) -> Iterator[tuple[Session, Session]]:
-    """Two sessions on one bus."""
+    """Two sessions on one bus, linked directly, so that no message changes its way meanwhile."""
     with Session.open(link) as a, Session.open(link) as b:
+        deadline = time.monotonic() + 2.0
+        while b._raw.info.zid() not in a._raw.info.peers_zid() and time.monotonic() < deadline:
+            time.sleep(0.01)
         yield a, b
 
 

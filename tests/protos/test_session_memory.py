@@ -162,11 +162,17 @@ def test_clients_that_nobody_holds_leave_the_bus(
     link: LinkConfig, finger: Finger, wait_until: Callable[..., None]
 ) -> None:
     """Zenoh's sessions lived on behind them, and nobody could close them."""
-    before = sockets()
-    for _ in range(3):
-        Client(link.connect[0], timeout_s=PATIENCE_S).features("finger", max_age_s=PATIENCE_S)
-    gc.collect()
-    wait_until(lambda: sockets() <= before, PATIENCE_S)
+    with Session.open(link) as session, session.publisher(FEATURES, sensor="finger") as service:
+
+        def ask() -> None:
+            robot = Client(link.connect[0], timeout_s=PATIENCE_S)
+            robot.features("finger", max_age_s=PATIENCE_S)
+            wait_until(service.matched, PATIENCE_S)
+
+        for _ in range(3):
+            ask()
+        gc.collect()
+        wait_until(lambda: not service.matched(), PATIENCE_S)
 
 
 def test_a_pose_publisher_in_use_keeps_its_client(
