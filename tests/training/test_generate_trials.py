@@ -11,7 +11,7 @@ import pytest
 
 from palpate.errors import DatasetError
 from palpate_training.experiment.generate.simulator import ExperimentSpec
-from palpate_training.experiment.generate.trials import make_trials
+from palpate_training.experiment.generate.trials import FINGERTIP, make_trials
 
 
 def test_trials_are_not_mixed_with_the_simulation_of_another_fingertip(tmp_path: Path) -> None:
@@ -27,8 +27,10 @@ def test_trials_are_not_mixed_with_the_simulation_of_another_fingertip(tmp_path:
             cast("Any", None), on_progress=lambda *_: None, stop=threading.Event(),
         )  # fmt: skip
 
-    assert made("a1", "trials")
+    (tmp_path / "trials").mkdir()
+    (tmp_path / "trials" / FINGERTIP).write_text("a1", encoding="utf-8")
     assert made("a1", "trials")
     with pytest.raises(DatasetError, match=r"trials holds trials of another .*mechanics\.sim"):
         made("b2", "trials")
-    assert made("b2", "other")
+    assert made("b2", "other"), "nothing is left to do, so nothing is written"
+    assert not (tmp_path / "other").exists()
