@@ -73,9 +73,10 @@ def test_all_arrays_of_a_tape_together_are_bounded(
 ) -> None:
     """None of them is expanded: sixty of 200 MiB would have taken all the memory."""
     monkeypatch.setattr(bounded, "_array", lambda name, _: pytest.fail(f"{name} was expanded"))
+    monkeypatch.setattr("palpate.files.tape._ARRAYS_BYTES_MAX", 1 << 20)
     path = tmp_path / "large.npz"
-    path.write_bytes(archive(bytes(200 << 20), zipfile.ZIP_DEFLATED, members=2))
-    with pytest.raises(DatasetError, match="419,430,400 bytes, 268,435,456 are allowed"):
+    path.write_bytes(archive(bytes(800 << 10), zipfile.ZIP_DEFLATED, members=2))
+    with pytest.raises(DatasetError, match="1,638,400 bytes, 1,048,576 are allowed"):
         read_tape(path)
 
 
