@@ -188,11 +188,12 @@ def stop_on_signals(*signals: signal.Signals) -> threading.Event:
     return stop
 
 
-def end_with_parent() -> None:
+def begin_worker() -> None:
     """Let a worker of `multiprocessing` end with the process that started it, also if killed.
 
-    Otherwise it would wait for its next task for ever.
+    Otherwise it would wait for its next task for ever. Ctrl-C is for that process alone.
     """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     from multiprocessing import parent_process  # of use to few processes
 
     parent = parent_process()

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -24,7 +23,7 @@ from rich.progress import Progress
 
 from palpate.errors import ConfigError, DatasetError
 from palpate.files.outputs import check_folder, check_output
-from palpate.process import end_with_parent
+from palpate.process import begin_worker
 from palpate_fem.calibration.calibrate import calibrate
 from palpate_fem.calibration.measured import SIMULATED, MeasuredIndentation
 from palpate_fem.calibration.recover import ParameterRecovery, plan_recovery, recover
@@ -196,7 +195,7 @@ def slope_simulator_for(
     others = set(active_children())
     with (
         ProcessPoolExecutor(
-            count, mp_context=get_context("spawn"), initializer=_begin_worker
+            count, mp_context=get_context("spawn"), initializer=begin_worker
         ) as executor,
         progress_bar() as bar,
     ):
@@ -206,12 +205,6 @@ def slope_simulator_for(
             for worker in set(active_children()) - others:
                 worker.kill()
             raise
-
-
-def _begin_worker() -> None:
-    # Ctrl-C is for the command, which ends its workers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
 
 
 class _SearchBar:

@@ -14,7 +14,6 @@ import json
 import logging
 import multiprocessing
 import os
-import signal
 import sys
 import time
 from collections import defaultdict
@@ -36,7 +35,7 @@ from palpate.cluster import WorkerLostError
 from palpate.errors import DatasetError
 from palpate.files.atomic import written_whole
 from palpate.files.hdf5 import add_array
-from palpate.process import end_with_parent
+from palpate.process import begin_worker
 from palpate_training.datasets.container import read_archive
 from palpate_training.learning.splits import Fold, RowSplit
 
@@ -310,9 +309,7 @@ _tasks: dict[str, Task] = {}
 
 
 def _take_tasks(tasks: dict[str, Task], device: str, begun: Synchronized[int]) -> None:
-    # Ctrl-C is for the command, which keeps what is under way.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    begin_worker()
     os.nice(5)  # so that the machine stays usable during a night's work
     if device == "cuda":
         with begun.get_lock():

@@ -24,7 +24,7 @@ from typing import Any, Generic, TypeVar
 
 from palpate.cluster import WorkerLostError
 from palpate.errors import ConfigError, PalpateError
-from palpate.process import end_with_parent
+from palpate.process import begin_worker
 from palpate_training.experiment.generate.pipeline import (
     MECHANICS,
     SPEC,
@@ -330,9 +330,9 @@ def _with_news(makers: Sequence[_Maker]) -> list[_Maker]:
 
 def _make(experiment: SharedExperiment[Any], link: Connection) -> None:
     """Make the experiments that come, until None comes or nobody is there any more."""
+    begin_worker()
     for number in (signal.SIGINT, signal.SIGTERM):  # those to the whole group are the command's
         signal.signal(number, lambda *_: None)  # unlike SIG_IGN not for processes that begin here
-    end_with_parent()
     # While some are pressed others need the cores, about as many as there are devices. More threads
     # than cores wait for each other: three fits of bases on two cores took 162 s, not 57 s.
     at_once = len(experiment.devices)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -12,7 +11,7 @@ from multiprocessing import get_context
 from typing import Protocol, TypeVar
 
 from palpate.cluster import AHEAD, WorkerLostError
-from palpate.process import end_with_parent, require
+from palpate.process import begin_worker, require
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
@@ -36,11 +35,9 @@ class TaskRunner(Protocol):
         """End the workers."""
 
 
-def begin_worker() -> None:
+def _begin() -> None:
     """Let a worker use one core: there are as many, and threads of each would only wait."""
-    # Ctrl-C is for the command. A worker that it ended would look as if memory had run out.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    begin_worker()
     limit_threads(1)
 
 
@@ -59,7 +56,7 @@ class WorkerProcesses:
         self._workers = workers
         # Spawned: forked children would share locks of threads that they do not have.
         self._pool = ProcessPoolExecutor(
-            workers, mp_context=get_context("spawn"), initializer=begin_worker
+            workers, mp_context=get_context("spawn"), initializer=_begin
         )
 
     def run(
